@@ -1,0 +1,1 @@
+"""Environment to verified demonstrations and a LeRobot dataset."""

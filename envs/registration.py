@@ -1,0 +1,14 @@
+"""Environment ids, registered by string so that importing the package stays light."""
+
+from __future__ import annotations
+
+
+def register_envs() -> None:
+    """Register every environment with Gymnasium; called once by `import vid2demo`."""
+    try:
+        from gymnasium.envs.registration import register, registry
+    except ModuleNotFoundError:  # the extract package is usable on its own
+        return
+
+    if "PandaPour-v0" not in registry:
+        register(id="PandaPour-v0", entry_point="vid2demo.envs.pouring:PandaPourEnv")

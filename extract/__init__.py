@@ -1,0 +1,1 @@
+"""Video to 6D object trajectory. Knows nothing of robots."""

@@ -1,0 +1,130 @@
+"""Rigid-body geometry shared by all rooms: poses, symmetry, projection, rotation grids.
+
+`T_a_b` is a (4, 4) matrix, the pose of frame b in frame a. Lengths in m, angles in rad. Camera frames are
+OpenCV's: x right, y down, z forward.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Symmetry:
+    """Rotational symmetry of an object about one axis of its own frame through its origin.
+
+    axis: unit vector in the object frame.
+    order: 1 = none, n >= 2 = n-fold, 0 = continuous (a body of revolution).
+    """
+
+    axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    order: int = 1
+
+    def __post_init__(self) -> None:
+        if self.order < 0:
+            raise ValueError(f"symmetry order must be 0 (continuous) or positive, got {self.order}")
+        if not math.isclose(float(np.linalg.norm(self.axis)), 1.0, abs_tol=1e-6):
+            raise ValueError(f"symmetry axis must be a unit vector, got {self.axis}")
+
+    def rotations(self, continuous_samples: int = 72) -> Array:
+        """(K, 3, 3) rotations that leave the object unchanged; a continuous symmetry is sampled."""
+        count = self.order or continuous_samples
+        angles_rad = 2 * np.pi * np.arange(count) / count
+        return np.asarray(Rotation.from_rotvec(angles_rad[:, None] * np.asarray(self.axis)).as_matrix())
+
+    def error_rad(self, R_a: Array, R_b: Array) -> Array:
+        """Smallest geodesic angle between rotations (..., 3, 3) over the symmetry group, in [0, pi].
+
+        For a continuous symmetry this is the angle between the two axes, exactly.
+        """
+        R_a, R_b = np.asarray(R_a, float), np.asarray(R_b, float)
+        if self.order == 0:
+            axis = np.asarray(self.axis)
+            return angle_between_rad(R_a @ axis, R_b @ axis)
+        errors = [rotation_angle_rad(R_a @ S, R_b) for S in self.rotations()]
+        return np.min(errors, axis=0)
+
+    def to_json(self) -> dict[str, Any]:
+        return {"axis": list(self.axis), "order": self.order}
+
+    @staticmethod
+    def from_json(value: dict[str, Any]) -> Symmetry:
+        x, y, z = (float(v) for v in value["axis"])
+        return Symmetry((x, y, z), int(value["order"]))
+
+
+def angle_between_rad(a: Array, b: Array) -> Array:
+    """Angle between unit vectors (..., 3), accurate near 0 and pi."""
+    return np.asarray(np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), np.sum(a * b, axis=-1)))
+
+
+def rotation_angle_rad(R_a: Array, R_b: Array) -> Array:
+    """Geodesic angle between rotation matrices (..., 3, 3), in [0, pi].
+
+    From chord length |R_a - R_b|_F = 2 sqrt(2) sin(angle / 2), which keeps its accuracy near zero.
+    """
+    chord = np.linalg.norm(np.asarray(R_a) - np.asarray(R_b), axis=(-2, -1))
+    return np.asarray(2 * np.arcsin(np.clip(chord / (2 * np.sqrt(2)), 0.0, 1.0)))
+
+
+def make_pose(R: Array | None = None, t: Array | tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Array:
+    """(4, 4) pose from a rotation (identity if None) and a translation in m."""
+    T = np.eye(4)
+    if R is not None:
+        T[:3, :3] = R
+    T[:3, 3] = t
+    return T
+
+
+def invert_pose(T: Array) -> Array:
+    """Inverse of rigid poses (..., 4, 4)."""
+    R_t = np.swapaxes(T[..., :3, :3], -1, -2)
+    inverse = np.zeros_like(T)
+    inverse[..., :3, :3] = R_t
+    inverse[..., :3, 3] = -np.einsum("...ij,...j->...i", R_t, T[..., :3, 3])
+    inverse[..., 3, 3] = 1.0
+    return inverse
+
+
+def transform_points(T: Array, points: Array) -> Array:
+    """Apply a pose (4, 4) to points (N, 3)."""
+    return points @ T[:3, :3].T + T[:3, 3]
+
+
+def project(camera_matrix: Array, points_camera_m: Array) -> Array:
+    """Pixels (N, 2) of points (N, 3) in the camera frame; points must lie in front of the camera."""
+    uvw = points_camera_m @ camera_matrix.T
+    return uvw[..., :2] / uvw[..., 2:]
+
+
+def look_at(eye_m: Array, target_m: Array, up: Array) -> Array:
+    """T_world_camera (OpenCV axes) of a camera at `eye_m` that looks at `target_m` with `up` upward in the image."""
+    z = np.asarray(target_m, float) - eye_m
+    z /= np.linalg.norm(z)
+    x = np.cross(z, up)
+    x /= np.linalg.norm(x)
+    return make_pose(np.column_stack([x, np.cross(z, x), z]), np.asarray(eye_m, float))
+
+
+def super_fibonacci_rotations(count: int) -> Array:
+    """(count, 3, 3) rotations spread evenly over SO(3) (Alexa, Super-Fibonacci Spirals, CVPR 2022)."""
+    phi, psi = math.sqrt(2.0), 1.533751168755204288118041
+    s = np.arange(count) + 0.5
+    r, big_r = np.sqrt(s / count), np.sqrt(1.0 - s / count)
+    alpha, beta = 2 * np.pi * s / phi, 2 * np.pi * s / psi
+    xyzw = np.stack([r * np.sin(alpha), r * np.cos(alpha), big_r * np.sin(beta), big_r * np.cos(beta)], axis=1)
+    return np.asarray(Rotation.from_quat(xyzw).as_matrix())
+
+
+def focal_prior_camera_matrix(width_px: int, height_px: int) -> Array:
+    """Camera matrix for an unknown camera: f = sqrt(w^2 + h^2), centred (FreePose, appendix A.4)."""
+    f = math.hypot(width_px, height_px)
+    return np.array([[f, 0.0, width_px / 2], [0.0, f, height_px / 2], [0.0, 0.0, 1.0]])

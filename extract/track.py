@@ -1,0 +1,124 @@
+"""`ObjectTrack`: the 6D trajectory of one object in one video, and its public file format `*.track.npz`."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .errors import UserError
+from .files import atomic_path
+from .geometry import Array, Symmetry
+
+SCHEMA = "vid2demo/object-track"
+SCHEMA_VERSION = 1
+
+
+@dataclass(frozen=True)
+class ObjectTrack:
+    """Pose of one object in every frame of a video.
+
+    T_camera_object: (N, 4, 4) poses; camera frame as in OpenCV, translation in m.
+    time_s: (N,) presentation time of each frame, strictly increasing.
+    camera_matrix: (3, 3) pinhole intrinsics in px.
+    confidence: (N,) in [0, 1].
+    visible: (N,) bool, False where the object is out of view or lost.
+    header: JSON-like; `object`, `mesh` (name, sha256, extents_m, symmetry, up_axis, and for library vessels
+        `library` = {category, params}), `image_size_px` [w, h], `video`, `camera`, `settings`.
+    """
+
+    T_camera_object: Array
+    time_s: Array
+    camera_matrix: Array
+    confidence: Array
+    visible: np.ndarray[Any, np.dtype[np.bool_]]
+    header: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        n = len(self.time_s)
+        expected = {
+            "T_camera_object": (n, 4, 4),
+            "time_s": (n,),
+            "camera_matrix": (3, 3),
+            "confidence": (n,),
+            "visible": (n,),
+        }
+        for name, shape in expected.items():
+            value = np.asarray(getattr(self, name))
+            if value.shape != shape:
+                raise ValueError(f"{name} has shape {value.shape}, expected {shape}")
+            if not np.all(np.isfinite(value)):
+                raise ValueError(f"{name} contains values that are not finite")
+        if n == 0:
+            raise ValueError("a track needs at least one frame")
+        if np.any(np.diff(self.time_s) <= 0):
+            raise ValueError("time_s must be strictly increasing")
+
+    def __len__(self) -> int:
+        return len(self.time_s)
+
+    @property
+    def name(self) -> str:
+        return str(self.header.get("object", "object"))
+
+    @property
+    def symmetry(self) -> Symmetry:
+        mesh = self.header.get("mesh", {})
+        return Symmetry.from_json(mesh["symmetry"]) if "symmetry" in mesh else Symmetry()
+
+    def save(self, path: Path) -> None:
+        """Write `*.track.npz` atomically."""
+        header = {
+            "schema": SCHEMA,
+            "version": SCHEMA_VERSION,
+            "units": {"length": "m", "time": "s", "image": "px"},
+            "frames": {"camera": "OpenCV: x right, y down, z forward", "pose": "T_camera_object: object in camera"},
+            **self.header,
+        }
+        with atomic_path(Path(path)) as temporary, open(temporary, "wb") as stream:
+            np.savez_compressed(
+                stream,
+                T_camera_object=np.asarray(self.T_camera_object, np.float64),
+                time_s=np.asarray(self.time_s, np.float64),
+                camera_matrix=np.asarray(self.camera_matrix, np.float64),
+                confidence=np.asarray(self.confidence, np.float64),
+                visible=np.asarray(self.visible, bool),
+                header=np.array(json.dumps(header, allow_nan=False)),
+            )
+
+    @staticmethod
+    def load(path: Path) -> ObjectTrack:
+        """Read a track. Raises UserError when the file is missing, damaged or of another kind."""
+        arrays, header = load_npz_with_header(Path(path), SCHEMA, SCHEMA_VERSION)
+        names = ("T_camera_object", "time_s", "camera_matrix", "confidence", "visible")
+        if missing := [name for name in names if name not in arrays]:
+            raise UserError(f"{path} lacks {', '.join(missing)}; write it again with `vid2demo extract`")
+        try:
+            return ObjectTrack(**{name: arrays[name] for name in names}, header=header)
+        except ValueError as error:
+            raise UserError(f"{path} is not a valid track: {error}") from error
+
+
+def load_npz_with_header(path: Path, schema: str, version: int) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Arrays and JSON header of one of this project's npz files, without pickle.
+
+    Raises UserError when the file is missing, damaged, of another schema or newer than this program.
+    """
+    if not path.is_file():
+        raise UserError(f"{path} does not exist")
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+        header = json.loads(str(arrays.pop("header")))
+    except (OSError, ValueError, KeyError, zipfile.BadZipFile, EOFError) as error:
+        raise UserError(f"{path} is damaged or not a {schema} file ({error}); write it again") from error
+    if header.get("schema") != schema:
+        raise UserError(f"{path} holds {header.get('schema', 'an unknown format')!r}, expected {schema!r}")
+    if int(header.get("version", 0)) > version:
+        raise UserError(f"{path} has version {header['version']}, this program reads up to {version}; update vid2demo")
+    return arrays, header

@@ -1,0 +1,1 @@
+"""Datasets and environments to trained and evaluated policies."""
