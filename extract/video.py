@@ -1,0 +1,216 @@
+"""Reading and writing video with real time stamps.
+
+Frames come upright (rotation flags applied) as RGB with their presentation time; nothing assumes a constant frame
+rate. The whole file is scanned (without decoding) before the first frame is handed out, so that a truncated file is
+one clear error at the start and not a short track at the end.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import av
+import cv2
+import numpy as np
+from av.video.frame import VideoFrame
+from numpy.typing import NDArray
+
+from .errors import UserError
+from .files import atomic_path, sha256_of_file
+
+Image = NDArray[np.uint8]
+
+# A few broken packets are common at the start of clips cut from a longer recording; more means a damaged file.
+MAX_BROKEN_FRACTION = 0.02
+REORDER_DEPTH = 8
+_CLOCK_HZ = 90_000
+
+
+@dataclass(frozen=True)
+class VideoInfo:
+    """What is known about a video file before decoding it.
+
+    width_px, height_px: size of the upright image.  time_s: (N,) presentation times of the packets, from 0, sorted.
+    rotation_deg: rotation flag already applied to the frames that `iterate_frames` yields.
+    """
+
+    path: Path
+    width_px: int
+    height_px: int
+    time_s: NDArray[np.float64]
+    rotation_deg: int
+    sha256: str
+
+    @property
+    def frame_count(self) -> int:
+        return len(self.time_s)
+
+    @property
+    def fps(self) -> float:
+        """Median frame rate in Hz."""
+        return float(1.0 / np.median(np.diff(self.time_s))) if len(self.time_s) > 1 else 25.0
+
+    @property
+    def duration_s(self) -> float:
+        return float(self.time_s[-1] - self.time_s[0]) + 1.0 / self.fps
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One upright frame: index in decoding order, presentation time in s from the first frame, (H, W, 3) RGB."""
+
+    index: int
+    time_s: float
+    rgb: Image
+
+
+def read_video_info(path: Path) -> VideoInfo:
+    """Scan a video file.
+
+    Raises UserError when it is missing, not a video, has no video stream or no frames, or is truncated.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise UserError(f"video {path} does not exist")
+    if path.stat().st_size == 0:
+        raise UserError(f"video {path} is empty (0 bytes)")
+    try:
+        with av.open(str(path)) as container:
+            if not container.streams.video:
+                raise UserError(f"{path} has no video stream (it holds {_stream_kinds(container)})")
+            stream = container.streams.video[0]
+            declared = int(stream.frames or 0)
+            stamps = [
+                packet.pts
+                for packet in container.demux(stream)
+                if packet.pts is not None and packet.size > 0 and not packet.is_corrupt
+            ]
+            time_base = float(stream.time_base or Fraction(1, _CLOCK_HZ))
+        if not stamps:
+            raise UserError(f"video {path} has a video stream but not one frame; record it again")
+        if len(stamps) < declared * (1 - MAX_BROKEN_FRACTION):
+            raise UserError(
+                f"video {path} is truncated: {len(stamps)} of {declared} frames are there; copy it again or cut it "
+                f"with `ffmpeg -i {path.name} -c copy repaired.mp4`"
+            )
+        first = next(_decode(path), None)
+    except (av.FFmpegError, OSError) as error:
+        raise UserError(f"{path} cannot be read as a video ({error.strerror or error}); is it complete?") from error
+    if first is None:
+        raise UserError(f"video {path}: none of its {len(stamps)} frames can be decoded; is it complete?")
+    height_px, width_px = _upright(first).shape[:2]
+    times = np.unique(np.asarray(stamps, float) * time_base)
+    return VideoInfo(path, width_px, height_px, times - times[0], _rotation_deg(first), sha256_of_file(path))
+
+
+def iterate_frames(path: Path, max_side_px: int | None = None) -> Iterator[Frame]:
+    """Yield the frames of a video in presentation order, shrunk so that the longer side is at most `max_side_px`.
+
+    Frames that cannot be decoded and frames whose time does not advance are left out. Raises UserError when more
+    than MAX_BROKEN_FRACTION of the file's frames cannot be decoded.
+    """
+    info = read_video_info(path)
+    scale = 1.0 if max_side_px is None else min(1.0, max_side_px / max(info.width_px, info.height_px))
+    size = (round(info.width_px * scale), round(info.height_px * scale))
+    count, last_s, start_s = 0, -np.inf, None
+    for frame in _decode(info.path):
+        time_s = float(frame.time or 0.0)
+        start_s = time_s if start_s is None else start_s
+        if time_s <= last_s:
+            continue
+        last_s = time_s
+        rgb = _upright(frame)
+        if scale < 1.0:
+            rgb = np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
+        yield Frame(count, time_s - start_s, rgb)
+        count += 1
+    if count < info.frame_count * (1 - MAX_BROKEN_FRACTION) - 1:
+        raise UserError(f"video {path} is damaged: {count} of {info.frame_count} frames can be decoded; copy it again")
+
+
+class VideoWriter:
+    """H.264 mp4 writer (yuv420p, so that every browser plays it); the file appears under its name when complete.
+
+    Use as a context manager; `write(rgb)` at the constant rate, or `write(rgb, time_s)` with real time stamps.
+    Odd image sizes lose their last row or column, since 4:2:0 chroma needs even sizes.
+    """
+
+    def __init__(self, path: Path, fps: float, crf: int = 20) -> None:
+        self._path, self._fps, self._crf = Path(path), fps, crf
+        self._resources = ExitStack()
+        self._container: Any = None
+        self._stream: Any = None
+        self._count = 0
+        self._last_pts = -1
+
+    def __enter__(self) -> VideoWriter:
+        temporary = self._resources.enter_context(atomic_path(self._path))
+        self._container = self._resources.enter_context(av.open(str(temporary), "w", options={"movflags": "faststart"}))
+        return self
+
+    def write(self, rgb: Image, time_s: float | None = None) -> None:
+        """Append one (H, W, 3) uint8 RGB image."""
+        height, width = rgb.shape[0] // 2 * 2, rgb.shape[1] // 2 * 2
+        if self._stream is None:
+            rate = Fraction(self._fps).limit_denominator(1001)
+            options = {"crf": str(self._crf), "preset": "veryfast", "threads": "1"}
+            self._stream = self._container.add_stream("libx264", rate=rate, options=options)
+            self._stream.width, self._stream.height, self._stream.pix_fmt = width, height, "yuv420p"
+            self._stream.codec_context.time_base = Fraction(1, _CLOCK_HZ)
+        frame = VideoFrame.from_ndarray(np.ascontiguousarray(rgb[:height, :width]), format="rgb24")
+        seconds = self._count / self._fps if time_s is None else time_s
+        frame.pts = self._last_pts = max(round(seconds * _CLOCK_HZ), self._last_pts + 1)
+        frame.time_base = Fraction(1, _CLOCK_HZ)
+        self._container.mux(self._stream.encode(frame))
+        self._count += 1
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> bool | None:
+        if kind is None and self._stream is not None:
+            self._container.mux(self._stream.encode(None))
+        return self._resources.__exit__(kind, error, trace)
+
+
+def _decode(path: Path) -> Iterator[VideoFrame]:
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        stream.thread_type = "AUTO"
+        # Streams cut from a longer recording can announce too small a reorder depth, and FFmpeg then hands frames
+        # out of order: a small heap puts them right.
+        waiting: list[tuple[float, int, VideoFrame]] = []
+        count = 0
+        for packet in container.demux(stream):
+            try:
+                frames = packet.decode()
+            except av.error.InvalidDataError:
+                continue  # counted by the caller, who knows how many frames there should be
+            for frame in frames:
+                heapq.heappush(waiting, (float(frame.time or 0.0), count, frame))
+                count += 1
+            while len(waiting) > REORDER_DEPTH:
+                yield heapq.heappop(waiting)[2]
+        while waiting:
+            yield heapq.heappop(waiting)[2]
+
+
+def _rotation_deg(frame: VideoFrame) -> int:
+    return round(float(getattr(frame, "rotation", 0) or 0) / 90) * 90 % 360
+
+
+def _upright(frame: VideoFrame) -> Image:
+    # FFmpeg's display matrix gives the counter-clockwise turn that makes the picture upright.
+    rgb = frame.to_ndarray(format="rgb24")
+    return np.ascontiguousarray(np.rot90(rgb, _rotation_deg(frame) // 90))
+
+
+def _stream_kinds(container: Any) -> str:
+    kinds = sorted({str(stream.type) for stream in container.streams})
+    return ", ".join(kinds) if kinds else "no streams at all"
