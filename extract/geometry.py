@@ -50,7 +50,7 @@ class Symmetry:
             axis = np.asarray(self.axis)
             return angle_between_rad(R_a @ axis, R_b @ axis)
         errors = [rotation_angle_rad(R_a @ S, R_b) for S in self.rotations()]
-        return np.min(errors, axis=0)
+        return np.asarray(np.min(errors, axis=0))
 
     def to_json(self) -> dict[str, Any]:
         return {"axis": list(self.axis), "order": self.order}

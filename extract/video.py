@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, cast
 
 import av
 import cv2
@@ -189,7 +189,7 @@ def _decode(path: Path) -> Iterator[VideoFrame]:
         count = 0
         for packet in container.demux(stream):
             try:
-                frames = packet.decode()
+                frames = cast(list[VideoFrame], packet.decode())
             except av.error.InvalidDataError:
                 continue  # counted by the caller, who knows how many frames there should be
             for frame in frames:
