@@ -67,7 +67,7 @@ def render_depth(
     return DepthWindow(depth, int(low[0]), int(low[1]))
 
 
-@numba.njit(cache=True, fastmath=True)  # type: ignore[untyped-decorator]
+@numba.njit(cache=True, fastmath=True)
 def _fill(uv: Array, z: Array, faces: NDArray[np.int32], depth: NDArray[np.float32]) -> None:
     """Z-buffer with 1/z interpolated linearly on the image plane, which is exact for planes in perspective."""
     h, w = depth.shape
