@@ -256,7 +256,7 @@ def vessel_from_header(entry: Mapping[str, Any], role: str) -> Vessel:
 
     if "library" in entry:
         library = entry["library"]
-        return make_vessel(str(library["category"]), **{k: float(v) for k, v in library["params"].items()})
+        return make_vessel(str(library["category"]), None, **{k: float(v) for k, v in library["params"].items()})
     if "file" in entry:
         raise UserError(
             f"the {role} is the mesh file {entry['file']}, which has no known interior or grasp; "
