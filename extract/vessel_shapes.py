@@ -1,0 +1,232 @@
+"""Solids that vessels are put together from: lofted walls, bent tubes, domes; and the planar curves they follow.
+
+Solids are `manifold3d.Manifold`, so that unions and differences stay watertight. Curves in the symmetry plane are
+(K, 2) points (x, z); profiles of walls are (K, 2) points (z, r) with ascending z.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import manifold3d
+import numpy as np
+from scipy.interpolate import PchipInterpolator
+
+from .geometry import Array
+from .vessel_types import section_outlines
+
+SEGMENTS = 64
+TUBE_SEGMENTS = 24
+Solid = manifold3d.Manifold
+
+
+@dataclass(frozen=True)
+class Lip:
+    """A pouring lip: the rim pulled outward toward +x.
+
+    reach_m: how far; depth_m: how far below the rim it begins; half_angle_rad: half its width around the axis.
+    """
+
+    reach_m: float
+    depth_m: float
+    half_angle_rad: float
+
+    def rise(self, z_m: Array, rim_m: float) -> Array:
+        """Share of the reach at height z: 0 below the lip, 1 at the rim and above."""
+        s = np.clip((z_m - rim_m) / self.depth_m + 1.0, 0.0, 1.0)
+        return np.asarray(s * s)
+
+    def volume_m3(self, z_m: Array, radius_m: Array, rim_m: float) -> float:
+        """Volume that the lip adds to a round interior, by integration over the height."""
+        z = np.linspace(rim_m - self.depth_m, rim_m, 400)
+        pull = self.reach_m * self.rise(z, rim_m)
+        # The angular shape is cos^2, whose integral is a and that of its square 3a/4 over [-a, a].
+        area = self.half_angle_rad * (np.interp(z, z_m, radius_m) * pull + 0.375 * pull**2)
+        return float(np.trapezoid(area, z))
+
+
+def rounded_path(points: Array, fillet_m: float | Sequence[float], steps: int = 8) -> Array:
+    """A polyline (K, D) with its inner corners replaced by circular arcs of radius `fillet_m` (one or K-2 values).
+
+    An arc that would not fit between its neighbours is made smaller.
+    """
+    points = np.asarray(points, float)
+    fillets = np.broadcast_to(np.asarray(fillet_m, float), (len(points) - 2,))
+    path = [points[0]]
+    for i, radius in enumerate(fillets, start=1):
+        before, corner, after = points[i - 1 : i + 2]
+        to_before, to_after = before - corner, after - corner
+        length_before, length_after = np.linalg.norm(to_before), np.linalg.norm(to_after)
+        u, v = to_before / length_before, to_after / length_after
+        cos_half = math.sqrt(max(0.0, 0.5 * (1 + float(u @ v))))
+        sin_half = math.sqrt(max(0.0, 1 - cos_half**2))
+        if cos_half < 1e-6 or radius <= 0:
+            path.append(corner)
+            continue
+        # A side shared with another corner may be used up to its middle only.
+        share_before, share_after = 0.95 if i == 1 else 0.49, 0.95 if i == len(points) - 2 else 0.49
+        tangent = min(radius * cos_half / sin_half, share_before * length_before, share_after * length_after)
+        radius = tangent * sin_half / cos_half
+        center = corner + (u + v) / np.linalg.norm(u + v) * (radius / sin_half)
+        start, end = corner + u * tangent - center, corner + v * tangent - center
+        sweep = math.acos(float(np.clip(start @ end / radius**2, -1, 1)))
+        for t in np.linspace(0, 1, steps + 1):
+            path.append(center + (math.sin((1 - t) * sweep) * start + math.sin(t * sweep) * end) / math.sin(sweep))
+    path.append(points[-1])
+    kept = [path[0]]
+    for point in path[1:]:
+        if np.linalg.norm(point - kept[-1]) > 1e-7:
+            kept.append(point)
+    return np.asarray(kept)
+
+
+def smooth_profile(knots: Sequence[tuple[float, float]], count: int = 80) -> Array:
+    """(count, 2) monotone-per-piece smooth curve (z, r) through knots with ascending z."""
+    z, r = np.asarray(knots, float).T
+    fine = np.linspace(z[0], z[-1], count)
+    return np.column_stack([fine, PchipInterpolator(z, r)(fine)])
+
+
+def resampled(profile: Array, spacing_m: float) -> Array:
+    """Profile (z, r) with points added so that no two neighbours are farther apart than `spacing_m`."""
+    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(profile, axis=0), axis=1))])
+    wanted = np.linspace(0, length[-1], max(2, math.ceil(length[-1] / spacing_m) + 1))
+    fine = np.union1d(wanted, length)
+    return np.column_stack([np.interp(fine, length, profile[:, 0]), np.interp(fine, length, profile[:, 1])])
+
+
+def simplified(profile: Array, tolerance_m: float) -> Array:
+    """Profile with the points left out that lie within `tolerance_m` of the chord (Douglas-Peucker)."""
+    keep = np.zeros(len(profile), bool)
+    keep[[0, -1]] = True
+    stack = [(0, len(profile) - 1)]
+    while stack:
+        a, b = stack.pop()
+        if b - a < 2:
+            continue
+        chord = profile[b] - profile[a]
+        offset = profile[a + 1 : b] - profile[a]
+        distance = np.abs(chord[0] * offset[:, 1] - chord[1] * offset[:, 0]) / max(float(np.linalg.norm(chord)), 1e-12)
+        worst = int(np.argmax(distance))
+        if distance[worst] > tolerance_m:
+            keep[a + 1 + worst] = True
+            stack += [(a, a + 1 + worst), (a + 1 + worst, b)]
+    return profile[keep]
+
+
+def eroded(outer: Array, wall_m: float, floor_z_m: float, top_z_m: float) -> Array:
+    """Inner profile (z, r) everywhere `wall_m` from the outer one, from the floor to the top.
+
+    Morphological erosion by a disc: it follows shoulders and flares at their true normal distance and closes
+    gracefully where the vessel narrows.
+    """
+    fine = resampled(outer, max(wall_m / 3, float(np.ptp(outer[:, 0])) / 1200))
+    z = np.unique(np.concatenate([[floor_z_m, top_z_m], fine[(fine[:, 0] > floor_z_m) & (fine[:, 0] < top_z_m), 0]]))
+    gap = np.abs(z[:, None] - fine[None, :, 0])
+    with np.errstate(invalid="ignore"):
+        reach = fine[None, :, 1] - np.sqrt(np.where(gap <= wall_m, wall_m**2 - gap**2, np.nan))
+    # Exactly at each z the wall is as thick as the disc even where the samples miss it.
+    r = np.fmin(np.nanmin(reach, axis=1), np.interp(z, outer[:, 0], outer[:, 1]) - wall_m)
+    return np.column_stack([z, r])
+
+
+def round_off(profile: Array, bottom_m: float, top_m: float, *, top_outward: bool = False) -> Array:
+    """Profile with its bottom edge rounded inward by `bottom_m` and its top edge by `top_m`.
+
+    top_outward: widen instead of narrow at the top, as the inner edge of a rim does.
+    """
+    z, r = profile[:, 0], profile[:, 1]
+    low, high = z[0], z[-1]
+    steps = 1 - np.cos(np.linspace(0, 0.5 * np.pi, 7))
+    fine = np.unique(np.concatenate([z, low + bottom_m * steps, high - top_m * steps]).round(7))
+    fine = np.unique(np.clip(fine, low, high))
+    radius = np.interp(fine, z, r)
+    if bottom_m > 0:
+        depth = np.clip(low + bottom_m - fine, 0, bottom_m)
+        radius = radius - (bottom_m - np.sqrt(bottom_m**2 - depth**2))
+    if top_m > 0:
+        depth = np.clip(fine - (high - top_m), 0, top_m)
+        change = top_m - np.sqrt(top_m**2 - depth**2)
+        radius = radius + change if top_outward else radius - change
+    return np.column_stack([fine, radius])
+
+
+def _solid(vertices: Array, faces: np.ndarray[tuple[int, ...], np.dtype[np.int64]]) -> Solid:
+    mesh = manifold3d.Mesh64(
+        vert_properties=np.ascontiguousarray(vertices, np.float64),
+        tri_verts=np.ascontiguousarray(faces, np.uint64),
+    )
+    solid = Solid(mesh)
+    if solid.is_empty():
+        raise ValueError(f"the loft is not a closed surface ({solid.status()})")
+    return solid
+
+
+def stacked_rings(rings: Array) -> Solid:
+    """Solid between K stacked polygons (K, n, 3), each counter-clockwise seen from ahead, with flat end caps."""
+    levels, n = rings.shape[:2]
+    vertices = np.concatenate([rings.reshape(-1, 3), rings[0].mean(0)[None], rings[-1].mean(0)[None]])
+    ring = np.arange(n)
+    following = np.roll(ring, -1)
+    faces = []
+    for level in range(levels - 1):
+        a, b = level * n, (level + 1) * n
+        faces.append(np.column_stack([a + ring, a + following, b + following]))
+        faces.append(np.column_stack([a + ring, b + following, b + ring]))
+    top = (levels - 1) * n
+    faces.append(np.column_stack([np.full(n, levels * n), following, ring]))
+    faces.append(np.column_stack([np.full(n, levels * n + 1), top + ring, top + following]))
+    return _solid(vertices, np.concatenate(faces))
+
+
+def lofted(
+    profile: Array, corner: Array | None = None, aspect: float = 1.0, lip: Lip | None = None, rim_m: float = 0.0
+) -> Solid:
+    """Solid whose horizontal cross-sections follow profile (z, r), closed by flat discs below and above."""
+    z, r = profile[:, 0], profile[:, 1]
+    xy = section_outlines(r, np.ones_like(r) if corner is None else corner, aspect, SEGMENTS)
+    if lip is not None:
+        angle = np.arctan2(xy[..., 1], xy[..., 0])
+        shape = np.where(np.abs(angle) < lip.half_angle_rad, np.cos(0.5 * np.pi * angle / lip.half_angle_rad) ** 2, 0.0)
+        pull = lip.reach_m * lip.rise(z, rim_m)[:, None] * shape
+        xy = xy * (1 + pull / np.linalg.norm(xy, axis=-1))[..., None]
+    return stacked_rings(np.concatenate([xy, np.broadcast_to(z[:, None, None], (*xy.shape[:2], 1))], axis=-1))
+
+
+def tube(path: Array, half_m: Array | float, half_y_m: Array | float | None = None, *, rounded: bool = False) -> Solid:
+    """Tube along a path (K, 2) of (x, z) in the symmetry plane, of elliptic cross-section.
+
+    half_m: half thickness within the plane, one value or (K,); half_y_m: across it, equal to half_m if None.
+    rounded: close the ends by domes instead of flat discs.
+    """
+    path = np.asarray(path, float)
+    a = np.array(np.broadcast_to(np.asarray(half_m, float), (len(path),)))
+    b = a if half_y_m is None else np.array(np.broadcast_to(np.asarray(half_y_m, float), (len(path),)))
+    edges = np.diff(path, axis=0)
+    edges /= np.linalg.norm(edges, axis=1, keepdims=True)
+    tangent = np.vstack([edges[:1], edges[:-1] + edges[1:], edges[-1:]])
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    if rounded:
+        turn = np.linspace(0, 0.5 * np.pi, 6)[1:-1]
+        turn = np.append(turn, np.deg2rad(86.0))
+        start = path[0] - tangent[0] * (a[0] * np.sin(turn))[::-1, None]
+        end = path[-1] + tangent[-1] * (a[-1] * np.sin(turn))[:, None]
+        path = np.vstack([start, path, end])
+        tangent = np.vstack([np.tile(tangent[0], (5, 1)), tangent, np.tile(tangent[-1], (5, 1))])
+        shrink = np.concatenate([np.cos(turn)[::-1], np.ones(len(a)), np.cos(turn)])
+        a, b = np.pad(a, 5, "edge") * shrink, np.pad(b, 5, "edge") * shrink
+    angle = 2 * np.pi * (np.arange(TUBE_SEGMENTS) + 0.5) / TUBE_SEGMENTS
+    # (normal, y, tangent) must be right-handed for the rings to run counter-clockwise seen from ahead.
+    normal = np.column_stack([tangent[:, 1], np.zeros(len(path)), -tangent[:, 0]])
+    center = np.column_stack([path[:, 0], np.zeros(len(path)), path[:, 1]])
+    rings = center[:, None] + (a[:, None] * np.cos(angle))[..., None] * normal[:, None]
+    rings = rings + (b[:, None] * np.sin(angle))[..., None] * np.array([0.0, 1.0, 0.0])
+    return stacked_rings(rings)
+
+
+def cumulative_share(path: Array) -> Array:
+    """(K,) share of the path's length at each point, from 0 to 1."""
+    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+    return np.asarray(length / length[-1])

@@ -1,0 +1,133 @@
+"""The procedural library of vessels: watertight meshes with walls and interiors, made by code from parameters."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+
+from . import vessel_cups as cups
+from . import vessel_kettles as kettles
+from .errors import UserError
+from .vessel_assembly import BLACK, STEEL, WOOD, Draft, assemble
+from .vessel_types import Color, GraspRegion, Outlet, Profile, Range, Section, Vessel
+
+__all__ = [
+    "CATEGORIES",
+    "GraspRegion",
+    "Outlet",
+    "Profile",
+    "Range",
+    "Section",
+    "Vessel",
+    "make_vessel",
+    "parameter_space",
+    "resolve_category",
+]
+
+# A seeded variant keeps to this share of the way from the nominal value to the limits, so that vessels drawn at
+# random look ordinary and fits still have room.
+VARIANT_SHARE = 0.6
+
+Palette = tuple[tuple[float, float, float], ...]
+CERAMIC: Palette = ((0.93, 0.92, 0.89), (0.70, 0.16, 0.13), (0.16, 0.30, 0.52), (0.20, 0.42, 0.33), (0.85, 0.66, 0.25))
+METAL: Palette = (STEEL[:3], (0.12, 0.12, 0.13), (0.72, 0.45, 0.30), (0.92, 0.92, 0.90))
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One category: its shape parameters, the function that drafts it, its usual colours, words that mean it."""
+
+    ranges: Mapping[str, Range]
+    draft: Callable[[Mapping[str, float], Color], Draft]
+    palette: Palette
+    words: tuple[str, ...] = ()
+
+
+_LIBRARY: dict[str, Entry] = {
+    "mug": Entry(cups.MUG, cups.mug, ((0.10, 0.35, 0.72), *CERAMIC), ("coffee mug",)),
+    "gooseneck_kettle": Entry(
+        kettles.GOOSENECK_KETTLE, kettles.gooseneck_kettle, METAL, ("kettle", "pour-over kettle", "coffee kettle")
+    ),
+}
+_COLOR_RANGES = ("red", "green", "blue")
+CATEGORIES: tuple[str, ...] = tuple(_LIBRARY)
+
+
+def parameter_space(category: str) -> dict[str, Range]:
+    """Limits and nominal value of every parameter of a category, its colour (red, green, blue in [0, 1]) included."""
+    entry = _entry(category)
+    colors = {n: Range(0.0, 1.0, v, "1") for n, v in zip(_COLOR_RANGES, entry.palette[0], strict=True)}
+    return {**entry.ranges, **colors}
+
+
+def make_vessel(category: str, seed: int | None = None, **params: float) -> Vessel:
+    """A vessel of the library.
+
+    seed: None for the nominal variant, else a seeded one. params: values for single parameters, over the seed's.
+    Raises UserError for an unknown category or parameter and for a value out of range.
+    """
+    space = parameter_space(category)
+    values = {name: r.nominal for name, r in space.items()} if seed is None else _variant(category, seed)
+    for name, value in params.items():
+        if name not in space:
+            raise UserError(f"a {category} has no parameter {name!r}; it has {', '.join(space)}")
+        limits = space[name]
+        if not limits.low <= value <= limits.high:
+            raise UserError(
+                f"{name}={value:g} of {category} is out of range; give {limits.low:g} to {limits.high:g}"
+                + ("" if limits.unit == "1" else f" {limits.unit}")
+            )
+        values[name] = float(value)
+    vessel = _build(category, tuple(values.items()))
+    # The cached mesh stays out of the callers' hands, who may move or scale theirs.
+    return replace(vessel, mesh=vessel.mesh.copy(), params=dict(vessel.params))
+
+
+def resolve_category(word: str) -> tuple[str, ...]:
+    """Categories that a user's word may mean: "kettle" gives every kettle, a category's name gives itself.
+
+    Raises UserError, listing what is known, for a word that means none.
+    """
+    plain = " ".join(word.strip().lower().replace("_", " ").replace("-", " ").split())
+    name = plain.replace(" ", "_")
+    if name in _LIBRARY:
+        return (name,)
+    found = tuple(c for c, entry in _LIBRARY.items() if plain in (w.replace("-", " ") for w in entry.words))
+    if found:
+        return found
+    raise UserError(_unknown(word))
+
+
+def _entry(category: str) -> Entry:
+    if category not in _LIBRARY:
+        raise UserError(_unknown(category))
+    return _LIBRARY[category]
+
+
+def _unknown(word: str) -> str:
+    close = difflib.get_close_matches(word.lower().replace(" ", "_"), CATEGORIES, n=1)
+    hint = f" (did you mean {close[0]}?)" if close else ""
+    return f"unknown vessel category {word!r}{hint}; the library has {', '.join(CATEGORIES)}"
+
+
+def _variant(category: str, seed: int) -> dict[str, float]:
+    """Parameter values of a seeded variant."""
+    entry = _entry(category)
+    rng = np.random.default_rng([seed, *category.encode()])
+    values = {}
+    for name, r in entry.ranges.items():
+        u = VARIANT_SHARE * rng.uniform(-1, 1)
+        values[name] = r.nominal + u * (r.high - r.nominal if u > 0 else r.nominal - r.low)
+    color = entry.palette[int(rng.integers(len(entry.palette)))]
+    return {**values, **dict(zip(_COLOR_RANGES, color, strict=True))}
+
+
+@lru_cache(maxsize=64)
+def _build(category: str, items: tuple[tuple[str, float], ...]) -> Vessel:
+    values = dict(items)
+    rgba = (values["red"], values["green"], values["blue"], 1.0)
+    return assemble(category, values, _entry(category).draft(values, rgba))
