@@ -1,0 +1,110 @@
+"""Candidate grasps of a vessel by the Panda's two fingers.
+
+Hand frame = `panda_hand_tcp`: z is the approach direction, the fingers close along y, the palm lies at negative z.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..extract.geometry import Array, invert_pose, make_pose, transform_points
+from .panda import FINGER_MAX_M
+from .receptacle import surface_points
+
+if TYPE_CHECKING:
+    from ..extract.vessels import GraspRegion, Vessel
+
+# What the fingers span at most, less a little room on both sides.
+MAX_WIDTH_M = 2 * FINGER_MAX_M - 0.002
+# Boxes of the hand in its own frame, m: (low, high). The pads end 1 cm beyond the tcp; the palm begins 45 mm behind.
+_PALM = (np.array([-0.032, -0.102, -0.14]), np.array([0.032, 0.102, -0.04]))
+_FINGER_X_M, _FINGER_Z_M, _FINGER_THICK_M = 0.011, (-0.045, 0.011), 0.018
+
+
+@dataclass(frozen=True)
+class Grasp:
+    """T_object_hand: (4, 4) pose of the hand in the object's frame.
+
+    kind: "handle" or "body". width_m: what the fingers span. cost: how little this grasp is liked, 0 is best.
+    """
+
+    T_object_hand: Array
+    kind: str
+    width_m: float
+    cost: float
+
+    @property
+    def T_hand_object(self) -> Array:
+        return invert_pose(self.T_object_hand)
+
+    @property
+    def fits_hand(self) -> bool:
+        return self.width_m <= MAX_WIDTH_M
+
+
+def grasp_candidates(vessel: Vessel) -> list[Grasp]:
+    """Grasps of all regions of a vessel: slid along the region, turned about it, pitched, with either palm side up.
+
+    Grasps whose palm or fingers would cut into the vessel are left out. Regions wider than the fingers open are used
+    only when the vessel has no other.
+    """
+    points = surface_points(vessel)
+    regions = list(vessel.grasps)
+    if narrow := [region for region in regions if region.width_m <= MAX_WIDTH_M]:
+        regions = narrow
+    grasps = [grasp for region in regions for grasp in _of_region(region, vessel)]
+    free = [grasp for grasp in grasps if not _cuts(grasp, points)]
+    # A vessel that no hand can hold cleanly is still shown to the user, who reads of it in the notes.
+    return free or grasps
+
+
+def _of_region(region: GraspRegion, vessel: Vessel) -> list[Grasp]:
+    axis = region.axis / np.linalg.norm(region.axis)
+    approach = region.approach - (region.approach @ axis) * axis
+    approach /= np.linalg.norm(approach)
+    upright = abs(axis[2]) > 0.9
+    around = region.kind == "body" and upright and vessel.section.kind == "round"
+    # A round body can be approached from anywhere, a handle from about where it points to.
+    turns_rad = np.arange(12) * np.pi / 6 if around else np.deg2rad([0.0, -25.0, 25.0])
+    if region.kind == "body" and not around:
+        turns_rad = np.array([0.0, np.pi])
+    grasps = []
+    for turn_rad in turns_rad:
+        z_turned = Rotation.from_rotvec(turn_rad * axis).apply(approach)
+        for pitch_deg in (-60.0, -40.0, -20.0, 0.0, 20.0, 40.0, 60.0):
+            closing = np.cross(axis, z_turned)
+            z = Rotation.from_rotvec(np.deg2rad(pitch_deg) * closing).apply(z_turned)
+            for slide in (-0.3, 0.0, 0.3):
+                center = region.center_m + slide * region.length_m * axis
+                cost = 0.3 * (pitch_deg / 60.0) ** 2 + 0.1 * abs(slide) + (0.1 if region.kind == "body" else 0.0)
+                if not around:
+                    cost += 0.2 * abs(turn_rad) / np.pi
+                if region.width_m > MAX_WIDTH_M:
+                    cost += 1.0
+                for side in (1.0, -1.0):
+                    R = np.column_stack([np.cross(side * closing, z), side * closing, z])
+                    grasps.append(Grasp(make_pose(R, center), region.kind, region.width_m, cost))
+    return grasps
+
+
+def _cuts(grasp: Grasp, points: Array) -> bool:
+    """Whether palm or fingers would stand inside the vessel's surface."""
+    local = transform_points(grasp.T_hand_object, points)
+    inside = np.all((local > _PALM[0]) & (local < _PALM[1]), axis=1)
+    half_m = 0.5 * min(grasp.width_m, MAX_WIDTH_M)
+    beside = np.abs(local[:, 1])
+    # 2 mm of the surface beside the fingers is what they press on.
+    finger = (
+        (np.abs(local[:, 0]) < _FINGER_X_M)
+        & (local[:, 2] > _FINGER_Z_M[0])
+        & (local[:, 2] < _FINGER_Z_M[1])
+        & (beside > half_m + 0.002)
+        & (beside < half_m + _FINGER_THICK_M)
+    )
+    if not grasp.fits_hand:
+        finger[:] = False
+    return bool(inside.sum() + finger.sum() > 2)
