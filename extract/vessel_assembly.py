@@ -43,6 +43,7 @@ class Walls:
     """Outer and inner profile (z, r) of a vessel's wall in the body frame, and what its cross-section is.
 
     corner_outer, corner_inner: corner ratio at every level of outer and inner, None for round.
+    sides: number of flat sides of a faceted outside around the round inside, 0 for none.
     """
 
     outer: Array
@@ -53,6 +54,7 @@ class Walls:
     corner_outer: Array | None = None
     corner_inner: Array | None = None
     lip: Lip | None = None
+    sides: int = 0
 
     def outer_radius(self, z_m: float) -> float:
         return float(np.interp(z_m, self.outer[:, 0], self.outer[:, 1]))
@@ -107,6 +109,7 @@ def round_walls(
     inner_fillet_m: float = 0.0,
     ceiling_m: float | None = None,
     lip: Lip | None = None,
+    sides: int = 0,
 ) -> Walls:
     """Walls of a round vessel from its outer profile (z, r).
 
@@ -126,7 +129,7 @@ def round_walls(
     outer, inner = simplified(outer, PROFILE_TOLERANCE_M), simplified(inner, PROFILE_TOLERANCE_M)
     if lip is not None:
         outer, inner = (with_levels(p, top_m - lip.depth_m * np.linspace(0.1, 1, 9)) for p in (outer, inner))
-    return Walls(outer, inner, wall_m, ceiling_m is None, lip=lip)
+    return Walls(outer, inner, wall_m, ceiling_m is None, lip=lip, sides=sides)
 
 
 def with_levels(profile: Array, z_m: Array) -> Array:
@@ -148,24 +151,34 @@ def lip_outlet(walls: Walls) -> Outlet:
 
 
 def spout(
-    walls: Walls, path: Array, root_radius_m: float, tip_radius_m: float, wall_m: float, rgba: Color
+    walls: Walls,
+    path: Array,
+    root_radius_m: float,
+    tip_radius_m: float,
+    wall_m: float,
+    rgba: Color,
+    *,
+    root_aspect: float = 1.0,
 ) -> tuple[Part, Part, Outlet]:
     """Hollow tapered tube from inside the body along `path` (K, 2) of (x, z) to its mouth: tube, channel, outlet.
 
-    The first point of the path only says at which height and in which direction the spout leaves the body.
+    The first point of the path only says at which height the spout leaves the body, horizontally at first.
+    root_aspect: width across the symmetry plane over width within it at the root; the mouth is round.
     """
     z_root = float(path[0, 1])
     channel_root = root_radius_m - wall_m
     span = np.linspace(z_root - root_radius_m, z_root + root_radius_m, 9)
-    chord = [math.sqrt(max(walls.inner_radius(z) ** 2 - root_radius_m**2, 0.0)) for z in span]
+    half_y = root_radius_m * root_aspect
+    chord = [math.sqrt(max(walls.inner_radius(z) ** 2 - half_y**2, 0.0)) for z in span]
     path = np.vstack([[min(chord) - 0.0015, z_root], path[path[:, 0] > min(chord) - 0.0005]])
     share = cumulative_share(path)
     outer_m = root_radius_m + (tip_radius_m - root_radius_m) * share
-    solid = tube(path, outer_m)
+    outer_y_m = outer_m * (1 + (root_aspect - 1) * (1 - share))
+    solid = tube(path, outer_m, outer_y_m)
     direction = path[-1] - path[-2]
     direction = direction / np.linalg.norm(direction)
     longer = np.vstack([path, path[-1] + direction * OVERCUT_M])
-    channel = tube(longer, np.append(outer_m, tip_radius_m) - wall_m)
+    channel = tube(longer, np.append(outer_m, tip_radius_m) - wall_m, np.append(outer_y_m, tip_radius_m) - wall_m)
     outlet = Outlet(
         "spout",
         np.array([path[-1, 0], 0.0, path[-1, 1]]),
@@ -246,7 +259,7 @@ def assemble(category: str, params: Mapping[str, float], draft: Draft) -> Vessel
     import trimesh
 
     walls = draft.walls
-    shell = lofted(walls.outer, walls.corner_outer, walls.aspect, walls.lip, walls.height_m)
+    shell = lofted(walls.outer, walls.corner_outer, walls.aspect, walls.lip, walls.height_m, walls.sides)
     cavity_profile, cavity_corner = walls.inner, walls.corner_inner
     if walls.is_open:
         cavity_profile = np.vstack([walls.inner, [walls.inner[-1, 0] + OVERCUT_M, walls.inner[-1, 1]]])

@@ -25,26 +25,26 @@ from .vessel_types import Color, Range
 Params = Mapping[str, float]
 
 GOOSENECK_KETTLE = {
-    "height_m": Range(0.11, 0.24, 0.177),
-    "base_radius_m": Range(0.05, 0.10, 0.075),
-    "top_radius_m": Range(0.03, 0.08, 0.0497),
-    "flare_height": Range(0.4, 1.0, 0.716, "1"),
+    "height_m": Range(0.10, 0.24, 0.155),
+    "base_radius_m": Range(0.045, 0.10, 0.067),
+    "top_radius_m": Range(0.03, 0.08, 0.0436),
+    "flare_height": Range(0.4, 1.0, 0.70, "1"),
     "wall_m": Range(0.0006, 0.002, 0.001),
-    "spout_start": Range(0.10, 0.40, 0.205, "1"),
-    "spout_reach_m": Range(0.12, 0.24, 0.158),
-    "spout_height_m": Range(0.12, 0.26, 0.179),
-    "spout_radius_m": Range(0.003, 0.009, 0.0043),
+    "spout_start": Range(0.10, 0.40, 0.185, "1"),
+    "spout_reach_m": Range(0.10, 0.24, 0.1375),
+    "spout_height_m": Range(0.10, 0.26, 0.158),
+    "spout_radius_m": Range(0.003, 0.009, 0.0039),
     "spout_taper": Range(0.6, 1.0, 0.82, "1"),
-    "spout_foot": Range(0.08, 0.6, 0.31, "1"),
-    "spout_neck_out": Range(0.15, 0.85, 0.57, "1"),
-    "spout_neck_up": Range(0.4, 0.9, 0.70, "1"),
-    "spout_tip_m": Range(0.004, 0.03, 0.010),
-    "handle_height": Range(0.5, 0.92, 0.785, "1"),
-    "handle_gap_m": Range(0.02, 0.06, 0.041),
-    "handle_lean_m": Range(-0.01, 0.06, 0.040),
-    "handle_drop_m": Range(0.05, 0.13, 0.094),
-    "handle_horn_m": Range(0.0, 0.05, 0.027),
-    "handle_radius_m": Range(0.007, 0.014, 0.0100),
+    "spout_foot": Range(0.08, 0.6, 0.37, "1"),
+    "spout_neck_out": Range(0.15, 0.85, 0.625, "1"),
+    "spout_neck_up": Range(0.4, 0.9, 0.725, "1"),
+    "spout_tip_m": Range(0.004, 0.03, 0.0085),
+    "handle_height": Range(0.5, 0.92, 0.765, "1"),
+    "handle_gap_m": Range(0.02, 0.06, 0.0365),
+    "handle_lean_m": Range(-0.01, 0.06, 0.039),
+    "handle_drop_m": Range(0.05, 0.13, 0.080),
+    "handle_horn_m": Range(0.0, 0.05, 0.023),
+    "handle_radius_m": Range(0.007, 0.014, 0.0090),
     "lid_radius": Range(0.6, 0.93, 0.90, "1"),
     "lid_height_m": Range(0.002, 0.04, 0.008),
 }
@@ -58,7 +58,7 @@ def gooseneck_kettle(p: Params, rgba: Color) -> Draft:
     corners = [(foot * 0.6, base), (foot, base), (corner_z, top)]
     if corner_z < h - 1e-4:
         corners.append((h, top))
-    outer = rounded_path(np.array(corners), [0.05 * h] + [0.45 * h] * (len(corners) - 3), steps=14)
+    outer = rounded_path(np.array(corners), [0.05 * h] + [1.3 * h] * (len(corners) - 3), steps=14)
     recess = 0.006
     walls = round_walls(
         outer,
@@ -91,7 +91,7 @@ def gooseneck_kettle(p: Params, rgba: Color) -> Draft:
             [wall_x + p["spout_foot"] * run, z0 + 0.055 * rise],
             [wall_x + neck_out * run, z0 + p["spout_neck_up"] * rise],
             [tip_x, z0 + rise],
-            [reach, z0 + rise - 0.1 * p["spout_tip_m"]],
+            [reach, z0 + rise - 0.2 * p["spout_tip_m"]],
         ]
     )
     path = rounded_path(polyline, [0.01, max(0.016, 2.2 * radius), 0.045, max(0.008, 1.5 * radius)], steps=8)
@@ -113,7 +113,7 @@ def gooseneck_kettle(p: Params, rgba: Color) -> Draft:
     stick_path = np.array([*stick, (x_low, z_low)])
     grip_path = rounded_path(stick_path, 0.03, steps=8) if len(stick_path) > 2 else stick_path
     share = np.linspace(0, 1, len(grip_path))
-    grip = tube(grip_path, grip_r * (1.05 - 0.2 * share), rounded=True)
+    grip = tube(grip_path, grip_r * (1.05 - 0.2 * share), dome=0.35)
     x_in = -(walls.inner_radius(z_stub) - 0.004)
     x_metal = x_body - 0.3 * p["handle_gap_m"]
     stub = Part(tube(np.array([[x_in, z_stub], [x_metal - 0.002, z_stub]]), 0.9 * grip_r), STEEL)

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import manifold3d
+from manifold3d import Manifold as Solid
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
@@ -19,7 +20,6 @@ from .vessel_types import section_outlines
 
 SEGMENTS = 64
 TUBE_SEGMENTS = 24
-Solid = manifold3d.Manifold
 
 
 @dataclass(frozen=True)
@@ -182,10 +182,22 @@ def stacked_rings(rings: Array) -> Solid:
 
 
 def lofted(
-    profile: Array, corner: Array | None = None, aspect: float = 1.0, lip: Lip | None = None, rim_m: float = 0.0
+    profile: Array,
+    corner: Array | None = None,
+    aspect: float = 1.0,
+    lip: Lip | None = None,
+    rim_m: float = 0.0,
+    sides: int = 0,
 ) -> Solid:
-    """Solid whose horizontal cross-sections follow profile (z, r), closed by flat discs below and above."""
+    """Solid whose horizontal cross-sections follow profile (z, r), closed by flat discs below and above.
+
+    sides: 0 for the cross-section of corner and aspect, else a regular polygon around the circle of radius r.
+    """
     z, r = profile[:, 0], profile[:, 1]
+    if sides:
+        turn = 2 * np.pi * (np.arange(sides) + 0.5) / sides
+        xy = r[:, None, None] / math.cos(math.pi / sides) * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+        return stacked_rings(np.concatenate([xy, np.broadcast_to(z[:, None, None], (*xy.shape[:2], 1))], axis=-1))
     xy = section_outlines(r, np.ones_like(r) if corner is None else corner, aspect, SEGMENTS)
     if lip is not None:
         angle = np.arctan2(xy[..., 1], xy[..., 0])
@@ -195,11 +207,11 @@ def lofted(
     return stacked_rings(np.concatenate([xy, np.broadcast_to(z[:, None, None], (*xy.shape[:2], 1))], axis=-1))
 
 
-def tube(path: Array, half_m: Array | float, half_y_m: Array | float | None = None, *, rounded: bool = False) -> Solid:
+def tube(path: Array, half_m: Array | float, half_y_m: Array | float | None = None, *, dome: float = 0.0) -> Solid:
     """Tube along a path (K, 2) of (x, z) in the symmetry plane, of elliptic cross-section.
 
     half_m: half thickness within the plane, one value or (K,); half_y_m: across it, equal to half_m if None.
-    rounded: close the ends by domes instead of flat discs.
+    dome: height of the domes that close the ends over half_m; 0 closes them by flat discs.
     """
     path = np.asarray(path, float)
     a = np.array(np.broadcast_to(np.asarray(half_m, float), (len(path),)))
@@ -208,11 +220,11 @@ def tube(path: Array, half_m: Array | float, half_y_m: Array | float | None = No
     edges /= np.linalg.norm(edges, axis=1, keepdims=True)
     tangent = np.vstack([edges[:1], edges[:-1] + edges[1:], edges[-1:]])
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
-    if rounded:
+    if dome > 0:
         turn = np.linspace(0, 0.5 * np.pi, 6)[1:-1]
         turn = np.append(turn, np.deg2rad(86.0))
-        start = path[0] - tangent[0] * (a[0] * np.sin(turn))[::-1, None]
-        end = path[-1] + tangent[-1] * (a[-1] * np.sin(turn))[:, None]
+        start = path[0] - tangent[0] * (dome * a[0] * np.sin(turn))[::-1, None]
+        end = path[-1] + tangent[-1] * (dome * a[-1] * np.sin(turn))[:, None]
         path = np.vstack([start, path, end])
         tangent = np.vstack([np.tile(tangent[0], (5, 1)), tangent, np.tile(tangent[-1], (5, 1))])
         shrink = np.concatenate([np.cos(turn)[::-1], np.ones(len(a)), np.cos(turn)])

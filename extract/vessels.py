@@ -12,7 +12,7 @@ import numpy as np
 from . import vessel_cups as cups
 from . import vessel_kettles as kettles
 from .errors import UserError
-from .vessel_assembly import BLACK, STEEL, WOOD, Draft, assemble
+from .vessel_assembly import STEEL, Draft, assemble
 from .vessel_types import Color, GraspRegion, Outlet, Profile, Range, Section, Vessel
 
 __all__ = [
