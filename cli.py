@@ -1,0 +1,465 @@
+"""The command `vid2demo`: parses, calls, prints. Everything heavy is imported by the command that needs it."""
+
+from __future__ import annotations
+
+import difflib
+import json
+import os
+import shlex
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+from tyro.conf import Positional, arg
+
+from .extract.errors import UserError
+from .extract.files import atomic_path, write_json
+from .extract.progress import Terminal
+from .extract.stages import Stage, plain, run_stages
+
+Box = tuple[float, float, float, float]
+Result = Mapping[str, Any]
+
+
+def told(metavar: str, text: str) -> Any:
+    """An option whose help tells its default in words."""
+    return arg(metavar=metavar, help=text, help_behavior_hint="")
+
+
+ReferenceFile = Annotated[Path, arg(metavar="REFERENCE", help="A *.reference.npz, as `retarget` writes it.")]
+Out = Annotated[Path, arg(metavar="DIR", help="Folder for the results; an interrupted command goes on in it.")]
+Seed = Annotated[int, arg(metavar="N", help="Seed of every random draw [integer].")]
+Episodes = Annotated[int, arg(metavar="N", help="Successful demonstrations to collect [count].")]
+Scale = Annotated[
+    Literal["auto"] | float,
+    arg(metavar="auto|FLOAT", help="Robot's motion over the video's [ratio]; auto takes what the arm can reach."),
+]
+Category = Annotated[str, arg(metavar="NAME", help="What is poured from: a word or category of `meshes list`.")]
+Receiver = Annotated[str, arg(metavar="NAME", help="What is poured into: a word or category of `meshes list`.")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Command:
+    """What all commands have."""
+
+    json: Annotated[bool, arg(help="Print the result as JSON on standard output.", help_behavior_hint="")] = False
+
+    def do(self) -> Result:
+        """Do the work; returns what is printed."""
+        raise AssertionError("a command without work")
+
+    def words(self, result: Result) -> str:
+        """The result for a person."""
+        return "\n".join(_lines(result))
+
+    def status(self, result: Result) -> int:
+        """The exit status: 0 when all is well, 1 when the work is done and its finding is bad."""
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Staged(Command):
+    """A command that writes a folder stage by stage."""
+
+    out: Out
+    force: Annotated[bool, arg(help="Do every stage again, even what has not changed.", help_behavior_hint="")] = False
+
+    def do_stages(
+        self, stages: Sequence[Stage], settings: Mapping[str, Any], video: Mapping[str, Any] | None = None
+    ) -> Result:
+        return run_stages(
+            self.out,
+            stages,
+            command=type(self).__name__.lower(),
+            settings=plain(settings),
+            video=video,
+            force=self.force,
+            listener=Terminal(),
+        )
+
+    def words(self, result: Result) -> str:
+        text = [line for stage in result["stages"].values() for line in _lines(stage["figures"])]
+        written = [name for stage in result["stages"].values() for name in stage["outputs"]]
+        text.append(f"written to {self.out}: {', '.join(written)}")
+        return "\n".join([*text, *(f"open {self.out / name}" for name in written if name == "report.html")])
+
+
+@dataclass(frozen=True, kw_only=True)
+class FromVideo(Staged):
+    """A command that looks at a video."""
+
+    video: Positional[Annotated[Path, arg(metavar="VIDEO", help="The clip: any file with a video that FFmpeg reads.")]]
+    object: Annotated[str, arg(metavar="NAME", help="What is handled: a word such as kettle; see `meshes list`.")]
+    receptacle: Annotated[
+        str | None,
+        told("NAME", "What is poured into, such as mug. Default: not followed; one stands under the lip."),
+    ] = None
+    box: Annotated[Box | None, told("X Y W H", "The object's box in the first frame [px]. Default: found.")] = None
+    receptacle_box: Annotated[
+        Box | None, told("X Y W H", "The receptacle's box in the first frame [px]. Default: found.")
+    ] = None
+    camera: Annotated[
+        Box | None, told("FX FY CX CY", "Camera intrinsics [px]. Default: f = sqrt(w^2 + h^2), centred.")
+    ] = None
+    mesh: Annotated[
+        Path | None, told("FILE", "Your mesh of the object (obj, ply, stl, glb). Default: the library's.")
+    ] = None
+    mesh_unit: Annotated[Literal["auto", "m", "cm", "mm", "in"], arg(help="Unit of length of --mesh.")] = "auto"
+    seed: Seed = 0
+
+    def settings(self, scale: float | Literal["auto"] = "auto", episodes: int = 0) -> Any:
+        from .run import ObjectSettings, RunSettings
+
+        return RunSettings(
+            self.video,
+            ObjectSettings(self.object, self.box, self.mesh, self.mesh_unit),
+            ObjectSettings(self.receptacle, self.receptacle_box) if self.receptacle else None,
+            camera=self.camera,
+            scale=scale,
+            episodes=episodes,
+            seed=self.seed,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Run(FromVideo):
+    """Do the whole way: a video in; tracks, a robot motion, a dataset and a report out.
+
+    What has not changed is not done again, so the same command goes on where it was interrupted. It ends by naming
+    the report to open. For example:
+
+    vid2demo run coffee.mp4 --object kettle --receptacle mug --out runs/coffee --episodes 10
+    """
+
+    scale: Scale = "auto"
+    episodes: Episodes = 10
+
+    def do(self) -> Result:
+        from .run import run
+
+        settings = self.settings(self.scale, self.episodes)
+        return run(settings, self.out, force=self.force, listener=Terminal())
+
+
+@dataclass(frozen=True, kw_only=True)
+class Extract(FromVideo):
+    """Follow the objects in a video: writes NAME.track.npz of each, and overlay.mp4 to look at.
+
+    For example:
+
+    vid2demo extract coffee.mp4 --object kettle --box 410 120 90 140 --out runs/coffee
+    """
+
+    def do(self) -> Result:
+        from .run import extract_stage, settings_record, video_identity
+
+        settings = self.settings()
+        stage = extract_stage(settings, self.out)
+        return self.do_stages([stage], settings_record(settings), video_identity(self.video))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Retarget(Staged):
+    """Move a track into the robot's world: writes NAME.reference.npz, NAME.joints.npz and feasibility.json.
+
+    For example:
+
+    vid2demo retarget runs/coffee/kettle.track.npz --scale 0.8 --out runs/smaller
+    """
+
+    track: Positional[Annotated[Path, arg(metavar="TRACK", help="The object's *.track.npz, as `extract` writes it.")]]
+    receptacle_track: Annotated[
+        Path | None, told("FILE", "The receptacle's *.track.npz. Default: one stands under the lip.")
+    ] = None
+    scale: Scale = "auto"
+    seed: Seed = 0
+
+    def do(self) -> Result:
+        from .run import reference_path, reference_stage, retarget_stage
+
+        settings = {"track": self.track, "receptacle_track": self.receptacle_track}
+        first = reference_stage(self.track, self.receptacle_track, self.out, scale=self.scale, seed=self.seed)
+        second = retarget_stage(reference_path(self.track, self.out), self.out)
+        return self.do_stages([first, second], settings | {"scale": self.scale, "seed": self.seed})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Simulate(Staged):
+    """Let the simulated robot pour along a reference: writes simulation.mp4 and series.json.
+
+    For example:
+
+    vid2demo simulate runs/coffee/kettle.reference.npz --video coffee.mp4 --out runs/coffee
+    """
+
+    reference: Positional[ReferenceFile]
+    joints: Annotated[Path | None, told("FILE", "The *.joints.npz to play. Default: the one beside the reference.")] = (
+        None
+    )
+    video: Annotated[Path | None, told("VIDEO", "The clip to show beside the robot. Default: the robot alone.")] = None
+
+    def do(self) -> Result:
+        from .run import joints_path, simulate_stage
+
+        joints = self.joints or joints_path(self.reference, self.reference.parent)
+        stage = simulate_stage(self.reference, joints, self.video, self.out)
+        return self.do_stages([stage], {"reference": self.reference, "joints": joints, "video": self.video})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Collect(Staged):
+    """Collect demonstrations with varied start and receptacle: writes a LeRobot v3.0 dataset to DIR/dataset.
+
+    Only successful episodes are kept, each replayed to the same end, bit for bit, before it is written. For example:
+
+    vid2demo collect runs/coffee/kettle.reference.npz --episodes 50 --out runs/coffee50
+    """
+
+    reference: Positional[ReferenceFile]
+    episodes: Episodes = 10
+    seed: Seed = 0
+
+    def do(self) -> Result:
+        from .run import collect_stage
+
+        chosen = {"episodes": self.episodes, "seed": self.seed}
+        stage = collect_stage(self.reference, self.out, episodes=self.episodes, seed=self.seed)
+        return self.do_stages([stage], {"reference": self.reference, **chosen})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Replay(Command):
+    """Play every episode of a dataset again from its stored seed and actions; tell how many end the same.
+
+    The exit status is 1 when an episode ends otherwise. For example:
+
+    vid2demo replay runs/coffee/dataset
+    """
+
+    dataset: Positional[Annotated[Path, arg(metavar="DATASET", help="A dataset folder that `collect` wrote.")]]
+
+    def do(self) -> Result:
+        from .demos.replay import replay
+
+        terminal = Terminal()
+        try:
+            return replay(self.dataset, progress=terminal.progress)
+        finally:
+            terminal.end()
+
+    def words(self, result: Result) -> str:
+        bad = [f"episode {d['episode']}: {'; '.join(d['differences'])}" for d in result["details"] if d["differences"]]
+        same = f"{result['same_end']} of {result['episodes']} episodes end the same, bit for bit"
+        return "\n".join([same, *bad, *result["notes"]])
+
+    def status(self, result: Result) -> int:
+        return 0 if result["same_end"] == result["episodes"] else 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report(Command):
+    """Write report.html of a run's folder anew: one page with videos, plots, findings and the next commands.
+
+    For example:
+
+    vid2demo report runs/coffee
+    """
+
+    folder: Positional[Annotated[Path, arg(metavar="DIR", help="Folder of a run, with its run.json.")]]
+
+    def do(self) -> Result:
+        from .report import write_report
+
+        return {"report": str(write_report(self.folder))}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Meshes(Command):
+    """The library of vessels: list the categories, show one's measures and parameters, or export its mesh.
+
+    For example:
+
+    vid2demo meshes list
+
+    vid2demo meshes show mug --seed 3
+
+    vid2demo meshes export mug --out meshes --format stl
+    """
+
+    action: Positional[Annotated[Literal["list", "show", "export"], arg(help="What to do.")]]
+    name: Positional[Annotated[str | None, arg(metavar="NAME", help="Category, for show and export.")]] = None
+    out: Annotated[Path | None, arg(metavar="DIR", help="Folder to export to.")] = None
+    format: Annotated[Literal["obj", "stl", "ply", "glb"], arg(help="File format of export; lengths in m.")] = "obj"
+    seed: Annotated[int | None, told("N", "A seeded variant [integer]. Default: the nominal one.")] = None
+
+    def do(self) -> Result:
+        from .extract.vessels import CATEGORIES, make_vessel, parameter_space, resolve_category
+
+        if self.action == "list":
+            return {"categories": {category: _measures(make_vessel(category)) for category in CATEGORIES}}
+        if self.name is None:
+            raise UserError(f"meshes {self.action} needs a category; the library has {', '.join(CATEGORIES)}")
+        category = resolve_category(self.name)[0]
+        vessel = make_vessel(category, self.seed)
+        parameters = {
+            key: {"value": vessel.params[key], "low": r.low, "high": r.high, "unit": r.unit}
+            for key, r in parameter_space(category).items()
+        }
+        shown: dict[str, Any] = {"category": category, "measures": _measures(vessel), "parameters": parameters}
+        if self.action == "show":
+            return shown
+        if self.out is None:
+            raise UserError("meshes export needs --out DIR, the folder to write to")
+        file = self.out / f"{category if self.seed is None else f'{category}_{self.seed}'}.{self.format}"
+        with atomic_path(file) as temporary:
+            vessel.mesh.export(temporary)
+        write_json(file.with_suffix(".json"), shown)
+        return {"mesh": str(file), "description": str(file.with_suffix(".json"))}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Synthesize(Staged):
+    """Render a clip of a pour with exact truth: video.mp4, truth.track.npz, receptacle.track.npz, settings.json.
+
+    For example:
+
+    vid2demo synthesize --category mug --seed 0 --out runs/clip
+    """
+
+    category: Category = "mug"
+    receptacle: Receiver = "bowl"
+    seconds: Annotated[float, arg(metavar="S", help="Length of the clip [s].")] = 6.0
+    fps: Annotated[float, arg(metavar="HZ", help="Frame rate [Hz].")] = 25.0
+    size: Annotated[tuple[int, int], arg(metavar="W H", help="Size of the picture [px], even numbers.")] = (640, 480)
+    without_hand: Annotated[
+        bool, arg(help="Leave out the hand that hides a part of the vessel.", help_behavior_hint="")
+    ] = False
+    seed: Seed = 0
+
+    def do(self) -> Result:
+        from .run import synthesize_stage
+
+        settings: dict[str, Any] = {"category": self.category, "receptacle": self.receptacle, "seed": self.seed}
+        settings |= {"seconds": self.seconds, "fps": self.fps, "size": self.size, "occluder": not self.without_hand}
+        return self.do_stages([synthesize_stage(self.out, settings)], settings)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Demo(Staged):
+    """Show the whole way without a video of yours: render a clip to DIR/clip, then do `run` on it.
+
+    For example:
+
+    vid2demo demo --out runs/demo
+    """
+
+    out: Out = Path("runs/demo")
+    category: Category = "mug"
+    receptacle: Receiver = "bowl"
+    seconds: Annotated[float, arg(metavar="S", help="Length of the clip [s].")] = 6.0
+    episodes: Episodes = 3
+    seed: Seed = 0
+
+    def do(self) -> Result:
+        from .run import ObjectSettings, RunSettings, run
+
+        clip = self.out / "clip"
+        chosen: dict[str, Any] = {"category": self.category, "receptacle": self.receptacle, "seconds": self.seconds}
+        Synthesize(out=clip, seed=self.seed, force=self.force, **chosen).do()
+        camera = json.loads((clip / "settings.json").read_text(encoding="utf-8"))["camera_matrix"]
+        settings = RunSettings(
+            clip / "video.mp4",
+            ObjectSettings(self.category),
+            ObjectSettings(self.receptacle),
+            camera=(camera[0][0], camera[1][1], camera[0][2], camera[1][2]),
+            episodes=self.episodes,
+            seed=self.seed,
+        )
+        return run(settings, self.out, force=self.force, listener=Terminal())
+
+
+def _measures(vessel: Any) -> dict[str, Any]:
+    """What tells one vessel from another, in the units a person reads."""
+    return {
+        "size_mm": [round(1e3 * float(extent), 1) for extent in vessel.extents_m],
+        "interior_ml": round(1e6 * vessel.interior_volume_m3),
+        "mass_g": round(1e3 * vessel.mass_kg),
+        "outlet": vessel.outlet.kind,
+        "symmetry": {0: "about z", 1: "none"}.get(vessel.symmetry.order, f"{vessel.symmetry.order}-fold about z"),
+    }
+
+
+COMMANDS: dict[str, type[Command]] = {
+    c.__name__.lower(): c for c in (Run, Extract, Retarget, Simulate, Collect, Replay, Report, Meshes, Synthesize, Demo)
+}
+
+
+def usage() -> str:
+    """What `vid2demo --help` prints."""
+    commands = "\n".join(f"  {name:<11} {(c.__doc__ or '').splitlines()[0]}" for name, c in COMMANDS.items())
+    return f"""usage: vid2demo COMMAND [options]
+
+A video of a person pouring in; a robot environment, verified robot demonstrations and a report out.
+
+Begin with one of
+  vid2demo demo
+  vid2demo run VIDEO --object kettle --receptacle mug --out runs/coffee
+
+commands:
+{commands}
+
+  vid2demo COMMAND --help tells a command's options, with an example;  vid2demo --version tells the version"""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line. Returns the exit status: 0 good, 1 not all well, 2 bad input, 130 interrupted."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    if not words or words[0] in ("-h", "--help", "help"):
+        print(usage())
+        return 0 if words else 2
+    if words[0] == "--version":
+        from . import __version__
+
+        print(f"vid2demo {__version__}")
+        return 0
+    if sys.platform == "linux":
+        os.environ.setdefault("MUJOCO_GL", "egl")  # no screen is needed
+    try:
+        return _dispatch(words)
+    except UserError as error:
+        print(f"vid2demo: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        again = shlex.join(["vid2demo", *words])
+        print(f"\nvid2demo: interrupted; to go on where it was, type again: {again}", file=sys.stderr)
+        return 130
+
+
+def _dispatch(words: list[str]) -> int:
+    name = words[0]
+    if name not in COMMANDS:
+        close = difflib.get_close_matches(name, COMMANDS, n=1)
+        hint = f" (did you mean {close[0]}?)" if close else ""
+        raise UserError(f"unknown command {name!r}{hint}; there are {', '.join(COMMANDS)}")
+    command = tyro.cli(COMMANDS[name], prog=f"vid2demo {name}", args=words[1:], config=(tyro.conf.FlagCreatePairsOff,))
+    result = plain(command.do())
+    print(json.dumps(result, indent=2, allow_nan=False) if command.json else command.words(result))
+    return command.status(result)
+
+
+def _lines(value: Mapping[str, Any], depth: int = 0) -> list[str]:
+    lines = []
+    for key, item in value.items():
+        name = "  " * depth + key.replace("_", " ")
+        if isinstance(item, dict) and len(item) < 6 and not any(isinstance(v, (dict, list)) for v in item.values()):
+            lines.append(f"{name}: {', '.join(_lines(item))}")
+        elif isinstance(item, dict):
+            lines += [name, *_lines(item, depth + 1)]
+        elif isinstance(item, list) and any(isinstance(entry, (str, dict)) for entry in item):
+            lines += [name, *("  " * (depth + 1) + str(entry) for entry in item)]
+        else:
+            lines.append(f"{name}: {f'{item:.4g}' if isinstance(item, float) else item}")
+    return lines

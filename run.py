@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from .extract.files import sha256_of_file, write_json
-from .extract.stages import PACKAGE_ROOT, Listener, Progress, Stage, plain, run_stages
+from .extract.progress import Listener, Progress
+from .extract.stages import PACKAGE_ROOT, Stage, plain, run_stages
 
 
 @dataclass(frozen=True)
@@ -50,6 +50,34 @@ def video_identity(path: Path) -> dict[str, Any]:
     return {"path": str(path), "sha256": info.sha256, **size, "duration_s": info.duration_s}
 
 
+def settings_record(settings: RunSettings) -> dict[str, Any]:
+    """The settings as `run.json` keeps them."""
+    return dict(plain(asdict(settings)))
+
+
+def reference_path(track: Path, folder: Path) -> Path:
+    """`folder/kettle.reference.npz` for a track `kettle.track.npz`."""
+    return folder / f"{_stem(track)}.reference.npz"
+
+
+def joints_path(reference: Path, folder: Path) -> Path:
+    """`folder/kettle.joints.npz` for a track or a reference of the kettle."""
+    return folder / f"{_stem(reference)}.joints.npz"
+
+
+def synthesize_stage(folder: Path, settings: Mapping[str, Any]) -> Stage:
+    """Settings of `extract.synthetic.synthesize` -> a clip with its truth."""
+
+    def work(progress: Progress) -> Mapping[str, Any]:
+        from .extract.synthetic import synthesize
+
+        clip = synthesize(out=folder, **settings, progress=progress)
+        return {"frames": len(clip.truth), "boxes_xywh_px": clip.boxes_xywh_px}
+
+    outputs = ("video.mp4", "truth.track.npz", "receptacle.track.npz", "settings.json")
+    return Stage("synthesize", "render a clip with exact truth", work, plain(settings), {}, outputs, ("extract",))
+
+
 def extract_stage(settings: RunSettings, folder: Path) -> Stage:
     """Video -> NAME.track.npz of each object, and overlay.mp4."""
     objects = [settings.object, *([settings.receptacle] if settings.receptacle else [])]
@@ -87,7 +115,7 @@ def reference_stage(
     track: Path, receptacle_track: Path | None, folder: Path, *, scale: float | Literal["auto"], seed: int
 ) -> Stage:
     """NAME.track.npz (and the receptacle's) -> NAME.reference.npz."""
-    output = f"{_stem(track)}.reference.npz"
+    output = reference_path(track, folder)
 
     def work(progress: Progress) -> Mapping[str, Any]:
         from .envs.placement import build_reference
@@ -95,7 +123,7 @@ def reference_stage(
 
         receptacle = ObjectTrack.load(receptacle_track) if receptacle_track else None
         reference = build_reference(ObjectTrack.load(track), receptacle, scale=scale, seed=seed)
-        reference.save(folder / output)
+        reference.save(output)
         return {
             "knots": len(reference),
             "duration_s": reference.duration_s,
@@ -110,14 +138,14 @@ def reference_stage(
         work,
         {"scale": scale, "seed": seed},
         {"track": track} | ({"receptacle track": receptacle_track} if receptacle_track else {}),
-        (output,),
+        (output.name,),
         ("extract", "envs"),
     )
 
 
 def retarget_stage(reference: Path, folder: Path) -> Stage:
     """NAME.reference.npz -> NAME.joints.npz and feasibility.json."""
-    output = f"{_stem(reference)}.joints.npz"
+    output = joints_path(reference, folder)
 
     def work(progress: Progress) -> Mapping[str, Any]:
         from .demos.feasibility import feasibility
@@ -126,7 +154,7 @@ def retarget_stage(reference: Path, folder: Path) -> Stage:
 
         wanted = Reference.load(reference)
         joints = retarget(wanted)
-        joints.save(folder / output)
+        joints.save(output)
         findings = plain(feasibility(wanted, joints))
         write_json(folder / "feasibility.json", findings)
         return dict(findings)
@@ -137,7 +165,7 @@ def retarget_stage(reference: Path, folder: Path) -> Stage:
         work,
         {},
         {"reference": reference},
-        (output, "feasibility.json"),
+        (output.name, "feasibility.json"),
         ("extract", "envs", "demos"),
     )
 
@@ -200,15 +228,15 @@ def run(
     settings: RunSettings, folder: Path, *, force: bool = False, listener: Listener | None = None
 ) -> dict[str, Any]:
     """The whole way from a video to a dataset and a report. Returns the content of `run.json`."""
-    os.environ.setdefault("MUJOCO_GL", "egl")
     name = settings.object.name
-    track, reference = folder / f"{name}.track.npz", folder / f"{name}.reference.npz"
+    track = folder / f"{name}.track.npz"
+    reference = reference_path(track, folder)
     receptacle = folder / f"{settings.receptacle.name}.track.npz" if settings.receptacle else None
     stages = [
         extract_stage(settings, folder),
         reference_stage(track, receptacle, folder, scale=settings.scale, seed=settings.seed),
         retarget_stage(reference, folder),
-        simulate_stage(reference, folder / f"{name}.joints.npz", settings.video, folder),
+        simulate_stage(reference, joints_path(track, folder), settings.video, folder),
         collect_stage(reference, folder, episodes=settings.episodes, seed=settings.seed),
     ]
     stages.append(report_stage(folder, stages))
@@ -216,7 +244,7 @@ def run(
         folder,
         stages,
         command="run",
-        settings=plain(asdict(settings)),
+        settings=settings_record(settings),
         video=video_identity(settings.video),
         force=force,
         listener=listener,

@@ -26,6 +26,8 @@ from typing import Any
 
 from .errors import UserError
 from .files import sha256_of_file, write_json
+from .progress import Listener
+from .progress import Progress as Progress
 
 SCHEMA = "vid2demo/run"
 SCHEMA_VERSION = 1
@@ -43,8 +45,6 @@ _PACKAGES = (
     "opencv-python-headless",
     "lerobot",
 )
-
-Progress = Callable[[int, int, str], None]
 
 
 @dataclass(frozen=True)
@@ -81,22 +81,6 @@ class Stage:
             "code": code_hash(self.rooms),
         }
         return hashlib.sha256(json.dumps(parts, sort_keys=True, allow_nan=False).encode()).hexdigest()
-
-
-class Listener:
-    """Told how a run goes on; this one keeps silent."""
-
-    def started(self, stage: Stage, number: int, count: int) -> None:
-        """A stage begins."""
-
-    def progress(self, done: int, total: int, text: str) -> None:
-        """The stage at work has finished `done` of `total` pieces."""
-
-    def finished(self, stage: Stage, seconds: float) -> None:
-        """The stage at work is done."""
-
-    def skipped(self, stage: Stage, number: int, count: int) -> None:
-        """A stage has nothing to do."""
 
 
 def content_hash(path: Path) -> str | None:
@@ -187,13 +171,17 @@ def run_stages(
         for number, stage in enumerate(stages, start=1):
             key = stage.key()
             if not force and _is_done(folder, record["stages"].get(stage.name), key):
-                listener.skipped(stage, number, len(stages))
+                listener.skipped(stage.title, number, len(stages))
                 continue
-            listener.started(stage, number, len(stages))
+            listener.started(stage.title, number, len(stages))
             _forget(folder, record, stage)
             _write(folder, record)
             begin_s = time.perf_counter()
-            figures = stage.work(listener.progress)
+            try:
+                figures = stage.work(listener.progress)
+            except BaseException:
+                listener.failed(stage.title)
+                raise
             seconds = time.perf_counter() - begin_s
             record["stages"][stage.name] = {
                 "key": key,
@@ -206,7 +194,7 @@ def run_stages(
                 "figures": plain(figures),
             }
             _write(folder, record)
-            listener.finished(stage, seconds)
+            listener.finished(stage.title, seconds)
         _write(folder, record)
     return record
 

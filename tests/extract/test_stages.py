@@ -16,7 +16,8 @@ import numpy as np
 import pytest
 from vid2demo.extract.errors import UserError
 from vid2demo.extract.files import write_text
-from vid2demo.extract.stages import Listener, Progress, Stage, content_hash, plain, read_run, run_stages
+from vid2demo.extract.progress import Listener, Progress
+from vid2demo.extract.stages import Stage, content_hash, plain, read_run, run_stages
 
 
 class Recorder(Listener):
@@ -25,11 +26,11 @@ class Recorder(Listener):
         self.skipped_names: list[str] = []
         self.pieces: list[tuple[int, int, str]] = []
 
-    def finished(self, stage: Stage, seconds: float) -> None:
-        self.done.append(stage.name)
+    def finished(self, title: str, seconds: float) -> None:
+        self.done.append(title)
 
-    def skipped(self, stage: Stage, number: int, count: int) -> None:
-        self.skipped_names.append(stage.name)
+    def skipped(self, title: str, number: int, count: int) -> None:
+        self.skipped_names.append(title)
 
     def progress(self, done: int, total: int, text: str) -> None:
         self.pieces.append((done, total, text))
@@ -46,7 +47,7 @@ def copy_stage(
         write_text(folder / target, change(text))
         return {"characters": len(text)}
 
-    return Stage(name or f"make {target}", f"write {target}", work, settings, {"source": source}, (target,))
+    return Stage(name or f"make {target}", name or f"make {target}", work, settings, {"source": source}, (target,))
 
 
 def chain(folder: Path, source: Path, **settings: Any) -> list[Stage]:
