@@ -15,6 +15,7 @@ from typing import Annotated, Any, Literal
 import tyro
 from tyro.conf import Positional, arg
 
+from . import __version__
 from .extract.errors import UserError
 from .extract.files import atomic_path, write_json
 from .extract.progress import Terminal
@@ -24,8 +25,8 @@ Box = tuple[float, float, float, float]
 Result = Mapping[str, Any]
 
 
-def told(metavar: str, text: str) -> Any:
-    """An option whose help tells its default in words."""
+def told(metavar: str | None, text: str) -> Any:
+    """An option whose help tells its default in words, or a flag."""
     return arg(metavar=metavar, help=text, help_behavior_hint="")
 
 
@@ -45,7 +46,7 @@ Receiver = Annotated[str, arg(metavar="NAME", help="What is poured into: a word 
 class Command:
     """What all commands have."""
 
-    json: Annotated[bool, arg(help="Print the result as JSON on standard output.", help_behavior_hint="")] = False
+    json: Annotated[bool, told(None, "Print the result as JSON on standard output.")] = False
 
     def do(self) -> Result:
         """Do the work; returns what is printed."""
@@ -65,7 +66,7 @@ class Staged(Command):
     """A command that writes a folder stage by stage."""
 
     out: Out
-    force: Annotated[bool, arg(help="Do every stage again, even what has not changed.", help_behavior_hint="")] = False
+    force: Annotated[bool, told(None, "Do every stage again, even what has not changed.")] = False
 
     def do_stages(
         self, stages: Sequence[Stage], settings: Mapping[str, Any], video: Mapping[str, Any] | None = None
@@ -129,9 +130,9 @@ class Run(FromVideo):
     """Do the whole way: a video in; tracks, a robot motion, a dataset and a report out.
 
     What has not changed is not done again, so the same command goes on where it was interrupted. It ends by naming
-    the report to open. For example:
+    the report to open.
 
-    vid2demo run coffee.mp4 --object kettle --receptacle mug --out runs/coffee --episodes 10
+    For example: vid2demo run coffee.mp4 --object kettle --receptacle mug --out runs/coffee --episodes 10
     """
 
     scale: Scale = "auto"
@@ -140,39 +141,36 @@ class Run(FromVideo):
     def do(self) -> Result:
         from .run import run
 
-        settings = self.settings(self.scale, self.episodes)
-        return run(settings, self.out, force=self.force, listener=Terminal())
+        return run(self.settings(self.scale, self.episodes), self.out, force=self.force, listener=Terminal())
 
 
 @dataclass(frozen=True, kw_only=True)
 class Extract(FromVideo):
     """Follow the objects in a video: writes NAME.track.npz of each, and overlay.mp4 to look at.
 
-    For example:
-
-    vid2demo extract coffee.mp4 --object kettle --box 410 120 90 140 --out runs/coffee
+    For example: vid2demo extract coffee.mp4 --object kettle --box 410 120 90 140 --out runs/coffee
     """
 
     def do(self) -> Result:
         from .run import extract_stage, settings_record, video_identity
 
-        settings = self.settings()
-        stage = extract_stage(settings, self.out)
-        return self.do_stages([stage], settings_record(settings), video_identity(self.video))
+        settings, identity = self.settings(), video_identity(self.video)
+        return self.do_stages([extract_stage(settings, self.out)], settings_record(settings), identity)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Retarget(Staged):
     """Move a track into the robot's world: writes NAME.reference.npz, NAME.joints.npz and feasibility.json.
 
-    For example:
-
-    vid2demo retarget runs/coffee/kettle.track.npz --scale 0.8 --out runs/smaller
+    For example: vid2demo retarget runs/coffee/kettle.track.npz --scale 0.8 --out runs/smaller
     """
 
     track: Positional[Annotated[Path, arg(metavar="TRACK", help="The object's *.track.npz, as `extract` writes it.")]]
     receptacle_track: Annotated[
         Path | None, told("FILE", "The receptacle's *.track.npz. Default: one stands under the lip.")
+    ] = None
+    receptacle: Annotated[
+        str | None, told("NAME", "Stand this vessel of the library under the lip. Default: what the track shows.")
     ] = None
     scale: Scale = "auto"
     seed: Seed = 0
@@ -180,19 +178,18 @@ class Retarget(Staged):
     def do(self) -> Result:
         from .run import reference_path, reference_stage, retarget_stage
 
-        settings = {"track": self.track, "receptacle_track": self.receptacle_track}
-        first = reference_stage(self.track, self.receptacle_track, self.out, scale=self.scale, seed=self.seed)
+        chosen = {"receptacle": self.receptacle, "scale": self.scale, "seed": self.seed}
+        first = reference_stage(self.track, self.receptacle_track, self.out, **chosen)
         second = retarget_stage(reference_path(self.track, self.out), self.out)
-        return self.do_stages([first, second], settings | {"scale": self.scale, "seed": self.seed})
+        files = {"track": self.track, "receptacle_track": self.receptacle_track}
+        return self.do_stages([first, second], files | chosen)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Simulate(Staged):
     """Let the simulated robot pour along a reference: writes simulation.mp4 and series.json.
 
-    For example:
-
-    vid2demo simulate runs/coffee/kettle.reference.npz --video coffee.mp4 --out runs/coffee
+    For example: vid2demo simulate runs/coffee/kettle.reference.npz --video coffee.mp4 --out runs/coffee
     """
 
     reference: Positional[ReferenceFile]
@@ -213,9 +210,9 @@ class Simulate(Staged):
 class Collect(Staged):
     """Collect demonstrations with varied start and receptacle: writes a LeRobot v3.0 dataset to DIR/dataset.
 
-    Only successful episodes are kept, each replayed to the same end, bit for bit, before it is written. For example:
+    Only successful episodes are kept, each replayed to the same end, bit for bit, before it is written.
 
-    vid2demo collect runs/coffee/kettle.reference.npz --episodes 50 --out runs/coffee50
+    For example: vid2demo collect runs/coffee/kettle.reference.npz --episodes 50 --out runs/coffee50
     """
 
     reference: Positional[ReferenceFile]
@@ -234,9 +231,9 @@ class Collect(Staged):
 class Replay(Command):
     """Play every episode of a dataset again from its stored seed and actions; tell how many end the same.
 
-    The exit status is 1 when an episode ends otherwise. For example:
+    The exit status is 1 when an episode ends otherwise.
 
-    vid2demo replay runs/coffee/dataset
+    For example: vid2demo replay runs/coffee/dataset
     """
 
     dataset: Positional[Annotated[Path, arg(metavar="DATASET", help="A dataset folder that `collect` wrote.")]]
@@ -251,9 +248,9 @@ class Replay(Command):
             terminal.end()
 
     def words(self, result: Result) -> str:
-        bad = [f"episode {d['episode']}: {'; '.join(d['differences'])}" for d in result["details"] if d["differences"]]
-        same = f"{result['same_end']} of {result['episodes']} episodes end the same, bit for bit"
-        return "\n".join([same, *bad, *result["notes"]])
+        from .demos.replay import as_text
+
+        return as_text(result)
 
     def status(self, result: Result) -> int:
         return 0 if result["same_end"] == result["episodes"] else 1
@@ -263,9 +260,7 @@ class Replay(Command):
 class Report(Command):
     """Write report.html of a run's folder anew: one page with videos, plots, findings and the next commands.
 
-    For example:
-
-    vid2demo report runs/coffee
+    For example: vid2demo report runs/coffee
     """
 
     folder: Positional[Annotated[Path, arg(metavar="DIR", help="Folder of a run, with its run.json.")]]
@@ -280,12 +275,7 @@ class Report(Command):
 class Meshes(Command):
     """The library of vessels: list the categories, show one's measures and parameters, or export its mesh.
 
-    For example:
-
-    vid2demo meshes list
-
-    vid2demo meshes show mug --seed 3
-
+    For example: vid2demo meshes list, vid2demo meshes show mug --seed 3,
     vid2demo meshes export mug --out meshes --format stl
     """
 
@@ -324,9 +314,7 @@ class Meshes(Command):
 class Synthesize(Staged):
     """Render a clip of a pour with exact truth: video.mp4, truth.track.npz, receptacle.track.npz, settings.json.
 
-    For example:
-
-    vid2demo synthesize --category mug --seed 0 --out runs/clip
+    For example: vid2demo synthesize --category mug --seed 0 --out runs/clip
     """
 
     category: Category = "mug"
@@ -351,9 +339,7 @@ class Synthesize(Staged):
 class Demo(Staged):
     """Show the whole way without a video of yours: render a clip to DIR/clip, then do `run` on it.
 
-    For example:
-
-    vid2demo demo --out runs/demo
+    For example: vid2demo demo --out runs/demo
     """
 
     out: Out = Path("runs/demo")
@@ -421,8 +407,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(usage())
         return 0 if words else 2
     if words[0] == "--version":
-        from . import __version__
-
         print(f"vid2demo {__version__}")
         return 0
     if sys.platform == "linux":
@@ -436,6 +420,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         again = shlex.join(["vid2demo", *words])
         print(f"\nvid2demo: interrupted; to go on where it was, type again: {again}", file=sys.stderr)
         return 130
+    except BrokenPipeError:  # the reader of our output has gone, as `head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
 
 
 def _dispatch(words: list[str]) -> int:

@@ -112,17 +112,25 @@ def extract_stage(settings: RunSettings, folder: Path) -> Stage:
 
 
 def reference_stage(
-    track: Path, receptacle_track: Path | None, folder: Path, *, scale: float | Literal["auto"], seed: int
+    track: Path,
+    receptacle_track: Path | None,
+    folder: Path,
+    *,
+    receptacle: str | None = None,
+    scale: float | Literal["auto"] = "auto",
+    seed: int = 0,
 ) -> Stage:
-    """NAME.track.npz (and the receptacle's) -> NAME.reference.npz."""
+    """NAME.track.npz (and the receptacle's) -> NAME.reference.npz. receptacle: a library vessel to stand there."""
     output = reference_path(track, folder)
 
     def work(progress: Progress) -> Mapping[str, Any]:
         from .envs.placement import build_reference
         from .extract.track import ObjectTrack
+        from .extract.vessels import make_vessel, resolve_category
 
-        receptacle = ObjectTrack.load(receptacle_track) if receptacle_track else None
-        reference = build_reference(ObjectTrack.load(track), receptacle, scale=scale, seed=seed)
+        vessel = make_vessel(resolve_category(receptacle)[0]) if receptacle else None
+        seen = ObjectTrack.load(receptacle_track) if receptacle_track else None
+        reference = build_reference(ObjectTrack.load(track), seen, scale=scale, receptacle=vessel, seed=seed)
         reference.save(output)
         return {
             "knots": len(reference),
@@ -136,7 +144,7 @@ def reference_stage(
         "reference",
         "place the motion in the robot's workspace",
         work,
-        {"scale": scale, "seed": seed},
+        {"scale": scale, "seed": seed, "receptacle": receptacle},
         {"track": track} | ({"receptacle track": receptacle_track} if receptacle_track else {}),
         (output.name,),
         ("extract", "envs"),
