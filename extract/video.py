@@ -160,7 +160,9 @@ class VideoWriter:
         height, width = rgb.shape[0] // 2 * 2, rgb.shape[1] // 2 * 2
         if self._stream is None:
             rate = Fraction(self._fps).limit_denominator(1001)
-            options = {"crf": str(self._crf), "preset": "veryfast", "threads": "1"}
+            # x264's macroblock tree reads memory it has not set on small pictures: without it, equal frames give
+            # equal bytes, on which hashes of inputs rely.
+            options = {"crf": str(self._crf), "preset": "veryfast", "threads": "1", "mbtree": "0"}
             self._stream = self._container.add_stream("libx264", rate=rate, options=options)
             self._stream.width, self._stream.height, self._stream.pix_fmt = width, height, "yuv420p"
             self._stream.codec_context.time_base = Fraction(1, _CLOCK_HZ)
