@@ -16,7 +16,7 @@ from ..extract.errors import UserError
 from ..extract.geometry import Array, angle_between_rad, invert_pose, make_pose
 from ..extract.track import ObjectTrack
 from .grasps import MAX_WIDTH_M
-from .panda import DQ_MAX_RAD_S, Q_HOME_RAD
+from .panda import DQ_MAX_RAD_S
 from .placement_search import Placement, Shortfall, Stage, search_placement
 from .receptacle import (
     bottom_m,
@@ -122,7 +122,6 @@ def build_reference(
         "T_hand_object": placement.grasp.T_hand_object.tolist(),
         "grasp": {"kind": placement.grasp.kind, "width_m": placement.grasp.width_m, "fits": placement.grasp.fits_hand},
         "q_start_rad": placement.q_rad[0].tolist(),
-        "q_rest_rad": Q_HOME_RAD.tolist(),
         "scale": factor,
         "scale_chosen": "auto" if scale == "auto" else "given",
         "time_stretch": 1.0,

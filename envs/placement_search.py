@@ -276,24 +276,24 @@ def _best_in_full(
     collide: bool,
 ) -> Placement | Shortfall:
     """Follow the best few through every knot; the first without collisions wins, else the least colliding."""
-    order = _diverse(batch, cost, tries)
-    chosen = batch.take(order)
-    q_full, miss = follow(
-        chosen.transforms(),
-        stage.T_object,
-        np.stack([grasps[g].T_object_hand for g in chosen.grasp]),
-        q[order, pour],
-        knots[pour],
-    )
+    chosen_index = _diverse(batch, cost, tries)
+    chosen = batch.take(chosen_index)
+    T_stage, T_object_hand = chosen.transforms(), np.stack([grasps[g].T_object_hand for g in chosen.grasp])
+    # From the pour to the start, then along the motion as `retarget` will go: near the start posture.
+    towards, _ = follow(T_stage, stage.T_object, T_object_hand, q[chosen_index, pour], knots[pour], Q_HOME_RAD, 0.05)
+    q_start, _ = solve_ik(T_stage @ stage.T_object[0] @ T_object_hand, towards[:, 0], iterations=10, damping=0.005)
+    q_full, miss = follow(T_stage, stage.T_object, T_object_hand, q_start, 0, q_start, 1.0)
+    full_cost = _costs(chosen, q_full, grasps, stage.time_s)
+    reached = miss.max(axis=1) < POSITION_TOLERANCE_M + 0.2 * ROTATION_TOLERANCE_RAD
     fallback: Placement | None = None
-    for rank in np.flatnonzero(miss.max(axis=1) < POSITION_TOLERANCE_M + 0.2 * ROTATION_TOLERANCE_RAD):
-        grasp, T = grasps[chosen.grasp[rank]], chosen.transforms()[rank]
+    for rank in [int(i) for i in np.argsort(full_cost) if reached[i]]:
+        grasp, T = grasps[chosen.grasp[rank]], T_stage[rank]
         collisions: list[Collision] = []
         if collide:
             T_receptacle = None if stage.T_receptacle is None else T @ stage.T_receptacle
             checker = CollisionChecker(stage.vessel, grasp.T_hand_object, grasp.width_m, stage.receptacle, T_receptacle)
             collisions = checker.check(q_full[rank], every=max(1, len(stage.time_s) // 40))
-        found = Placement(T, grasp, q_full[rank], float(cost[order[rank]]), collisions)
+        found = Placement(T, grasp, q_full[rank], float(full_cost[rank]), collisions)
         if not collisions:
             return found
         if fallback is None or _depth(found) < _depth(fallback):
@@ -323,11 +323,19 @@ def _diverse(batch: _Batch, cost: Array, count: int) -> NDArray[np.int64]:
     return np.array(kept, np.int64)
 
 
-def follow(T_world_stage: Array, T_object: Array, T_object_hand: Array, q_rad: Array, knot: int) -> tuple[Array, Array]:
+def follow(
+    T_world_stage: Array,
+    T_object: Array,
+    T_object_hand: Array,
+    q_rad: Array,
+    knot: int,
+    q_rest_rad: Array,
+    rest_gain: float,
+) -> tuple[Array, Array]:
     """Joint motions (C, N, 7) of C placements through every knot, from q (C, 7) at `knot` to both ends.
 
-    T_world_stage, T_object_hand: (C, 4, 4); T_object: (N, 4, 4). Also returns the misses (C, N) in m, 1 rad of rotation
-    counting as 0.2 m.
+    T_world_stage, T_object_hand: (C, 4, 4); T_object: (N, 4, 4). The redundancy draws near `q_rest_rad`. Also returns
+    the misses (C, N) in m, 1 rad of rotation counting as 0.2 m.
     """
     count = len(T_object)
     q = np.zeros((len(q_rad), count, 7))
@@ -338,7 +346,12 @@ def follow(T_world_stage: Array, T_object: Array, T_object_hand: Array, q_rad: A
             previous = q[:, knot]
         target = T_world_stage @ T_object[k] @ T_object_hand
         previous, error = solve_ik(
-            target, previous, iterations=8 if k == knot else 3, q_rest_rad=Q_HOME_RAD, damping=0.01
+            target,
+            previous,
+            iterations=8 if k == knot else 3,
+            q_rest_rad=q_rest_rad,
+            rest_gain=rest_gain,
+            damping=0.01,
         )
         q[:, k] = previous
         miss[:, k] = np.linalg.norm(error[:, :3], axis=1) + 0.2 * np.linalg.norm(error[:, 3:], axis=1)

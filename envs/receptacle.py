@@ -186,7 +186,7 @@ def _yaw_matrix(yaw_rad: float) -> Array:
 
 def _shift_sentence(shift: Array, ray: Array | None) -> str:
     total_cm = 100 * float(np.linalg.norm(shift))
-    if total_cm < 0.5:
+    if total_cm < 0.75:
         return "The receptacle stands where it was seen."
     if ray is None or np.linalg.norm(ray[:2]) < 1e-6:
         return f"The receptacle was moved by {total_cm:.0f} cm so that the jet lands in it."
@@ -194,7 +194,9 @@ def _shift_sentence(shift: Array, ray: Array | None) -> str:
     along_cm = 100 * float(shift @ sight)
     aside_cm = 100 * float(np.linalg.norm(shift - (shift @ sight) * sight))
     word = "away from" if along_cm > 0 else "toward"
-    return (
-        f"The receptacle was moved by {abs(along_cm):.0f} cm {word} the camera, along the line of sight in which "
-        f"one camera measures badly, and by {aside_cm:.0f} cm sideways, so that the jet lands in it."
-    )
+    moves = []
+    if abs(along_cm) >= 0.5:
+        moves.append(f"{abs(along_cm):.0f} cm {word} the camera (a single camera measures depth badly)")
+    if aside_cm >= 0.5:
+        moves.append(f"{aside_cm:.0f} cm sideways")
+    return f"The receptacle was moved by {' and by '.join(moves)}, so that the jet lands in it."
