@@ -1,16 +1,12 @@
-"""Writing and reading LeRobot datasets (v3.0) whose episodes can be replayed bit for bit.
-
-Beside LeRobot's own files a dataset holds `meta/vid2demo/`: `collection.json` (environment, settings, versions and a
-digest per episode), `reference.npz` (a copy) and `episode_000000.npz` ... (seed, actions, first and last state).
-"""
+"""Writing LeRobot datasets (v3.0) whose episodes can be replayed bit for bit; `stored.py` reads them."""
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,12 +19,17 @@ from ..extract.files import sha256_of_file, write_json, write_text
 from .camera_encoder import ENCODER, ENCODER_EXTRA, histogram_statistics
 from .dataset_card import dataset_card
 from .episode import Episode
+from .stored import (
+    COLLECTION_FILE,
+    COLLECTION_SCHEMA,
+    COLLECTION_VERSION,
+    RECORD_FOLDER,
+    REFERENCE_FILE,
+    check_dataset,
+    read_columns,
+    read_info,
+)
 
-COLLECTION_SCHEMA = "vid2demo/collection"
-COLLECTION_VERSION = 1
-RECORD_FOLDER = Path("meta/vid2demo")
-COLLECTION_FILE = RECORD_FOLDER / "collection.json"
-REFERENCE_FILE = RECORD_FOLDER / "reference.npz"
 QUANTILES_PERCENT = (1, 10, 50, 90, 99)
 
 
@@ -130,6 +131,13 @@ def write_dataset(
     episode_files: saved `Episode`s with frames, in order.  collection: what `collection.json` is to say besides the
     episodes.  The caller renames `root` to its final place: a folder under this name may be half-written.
     """
+    with _quiet():
+        _write_dataset(root, episode_files, layout, reference, collection)
+
+
+def _write_dataset(
+    root: Path, episode_files: Sequence[Path], layout: DatasetLayout, reference: Path, collection: Mapping[str, Any]
+) -> None:
     lerobot_dataset = import_lerobot()
     from lerobot.configs import RGBEncoderConfig
 
@@ -192,6 +200,22 @@ def write_dataset(
     check_dataset(root)
 
 
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep progress bars of every single episode and the remuxer's remarks off the screen."""
+    import av.logging
+    import datasets
+
+    shown = datasets.utils.is_progress_bar_enabled()
+    datasets.disable_progress_bars()
+    av.logging.set_libav_level(av.logging.ERROR)
+    try:
+        yield
+    finally:
+        if shown:
+            datasets.enable_progress_bars()
+
+
 def _check_fits(episode: Episode, layout: DatasetLayout, path: Path) -> None:
     widths = (
         ("action", episode.action, layout.action_names),
@@ -230,103 +254,3 @@ def _write_exact_stats(
             for name, value in histogram_statistics(histograms[camera], frame_count).items()
         }
     write_stats(stats, root)
-
-
-def read_info(root: Path) -> dict[str, Any]:
-    """`meta/info.json`. Raises UserError when `root` is not a LeRobot dataset of version 3."""
-    path = Path(root) / "meta/info.json"
-    if not path.is_file():
-        raise UserError(f"{root} is not a LeRobot dataset (no meta/info.json); name the folder `collect` wrote")
-    try:
-        info = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise UserError(f"{path} is damaged ({error}); collect the dataset again") from error
-    if not str(info.get("codebase_version", "")).startswith("v3"):
-        raise UserError(f"{root} has format {info.get('codebase_version')!r}, expected v3.0")
-    return dict(info)
-
-
-def read_collection(root: Path) -> dict[str, Any]:
-    """`collection.json`. Raises UserError when the dataset was not written by this project or is damaged."""
-    read_info(root)
-    path = Path(root) / COLLECTION_FILE
-    if not path.is_file():
-        raise UserError(f"{root} is a LeRobot dataset without {COLLECTION_FILE}: only what `collect` wrote can replay")
-    try:
-        collection = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise UserError(f"{path} is damaged ({error}); collect the dataset again") from error
-    if collection.get("schema") != COLLECTION_SCHEMA or int(collection.get("version", 0)) > COLLECTION_VERSION:
-        raise UserError(
-            f"{path} has schema {collection.get('schema')!r} version {collection.get('version')}, this program reads "
-            f"{COLLECTION_SCHEMA!r} up to {COLLECTION_VERSION}; update vid2demo"
-        )
-    return dict(collection)
-
-
-def read_columns(root: Path, names: Sequence[str]) -> dict[str, NDArray[Any]]:
-    """Columns of all rows in order, (rows,) or (rows, width), straight from the parquet files."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    files = sorted((Path(root) / "data").glob("*/*.parquet"))
-    if not files:
-        raise UserError(f"{root} holds no data (no data/*/*.parquet); collect the dataset again")
-    try:
-        tables = [pq.read_table(path, columns=list(names)) for path in files]
-    except (pa.ArrowException, OSError, KeyError) as error:
-        raise UserError(f"the rows of {root} cannot be read ({error}); collect the dataset again") from error
-    if missing := [name for name in names if name not in tables[0].column_names]:
-        raise UserError(f"{root} lacks the columns {', '.join(missing)}; collect the dataset again")
-    columns = {}
-    for name in names:
-        column = pa.chunked_array([chunk for table in tables for chunk in table[name].chunks]).combine_chunks()
-        if pa.types.is_list(column.type) or pa.types.is_fixed_size_list(column.type):
-            columns[name] = np.asarray(column.flatten()).reshape(len(column), -1)
-        else:
-            columns[name] = np.asarray(column.to_numpy(zero_copy_only=False))
-    return columns
-
-
-def check_dataset(root: Path) -> None:
-    """Raise UserError unless rows, episodes and the frames of every mp4 agree in number and time."""
-    import pyarrow.parquet as pq
-
-    info = read_info(root)
-    fps = int(info["fps"])
-    episode_index = read_columns(root, ["episode_index"])["episode_index"]
-    lengths = np.bincount(episode_index, minlength=int(info["total_episodes"]))
-    if len(episode_index) != info["total_frames"] or len(lengths) != info["total_episodes"]:
-        raise UserError(
-            f"{root} has {len(episode_index)} rows in {len(lengths)} episodes, its info.json says "
-            f"{info['total_frames']} in {info['total_episodes']}; collect the dataset again"
-        )
-    rows = [
-        row for path in sorted((root / "meta/episodes").glob("*/*.parquet")) for row in pq.read_table(path).to_pylist()
-    ]
-    for key in (name for name, feature in info["features"].items() if feature["dtype"] == "video"):
-        expected: dict[Path, int] = {}
-        for row in rows:
-            place = {name: row[f"videos/{key}/{name}"] for name in ("chunk_index", "file_index")}
-            path = root / info["video_path"].format(video_key=key, **place)
-            start = expected.get(path, 0)
-            if abs(row[f"videos/{key}/from_timestamp"] * fps - start) > 1e-3:
-                raise UserError(
-                    f"episode {row['episode_index']} of {root} starts in {path.name} of {key} at "
-                    f"{row[f'videos/{key}/from_timestamp']} s instead of {start / fps} s; collect the dataset again"
-                )
-            expected[path] = start + int(lengths[row["episode_index"]])
-        for path, count in expected.items():
-            if (found := count_frames(path)) != count:
-                raise UserError(f"{path} has {found} frames for {count} rows; collect the dataset again")
-
-
-def count_frames(path: Path) -> int:
-    """Number of frames in a video file, counted and not believed from its header."""
-    import av
-
-    try:
-        with av.open(str(path)) as container:
-            return sum(1 for packet in container.demux(container.streams.video[0]) if packet.size)
-    except (OSError, av.FFmpegError, IndexError) as error:
-        raise UserError(f"{path} cannot be read as a video ({error}); collect the dataset again") from error

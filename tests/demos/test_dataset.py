@@ -10,17 +10,16 @@ from typing import Any
 import numpy as np
 import pytest
 from vid2demo.demos.camera_encoder import CameraEncoder, histogram_statistics
-from vid2demo.demos.dataset import (
+from vid2demo.demos.dataset import DatasetLayout, write_dataset
+from vid2demo.demos.episode import Episode, flatten_state, state_difference, state_digest
+from vid2demo.demos.stored import (
     COLLECTION_FILE,
-    DatasetLayout,
     check_dataset,
     count_frames,
     read_collection,
     read_columns,
     read_info,
-    write_dataset,
 )
-from vid2demo.demos.episode import Episode, flatten_state, state_difference, state_digest
 from vid2demo.extract.errors import UserError
 
 SIZE = (64, 48)
