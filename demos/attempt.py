@@ -16,9 +16,10 @@ from .dataset import DatasetLayout
 from .episode import Episode, state_difference
 from .rollout import DEFAULT_ENV_ID, ActionPlayer, ReferencePlayer, control_rate, make_env, roll_out
 
-# The motions are absolute joint targets, and every attempt is to differ from the others.
+# The motions are absolute joint targets, and every attempt is to differ from the others. What the episodes hang on is
+# written out, so that a dataset does not depend on defaults that may change.
 FIXED_ENV_KWARGS = {"control_mode": "joint_position"}
-DEFAULT_ENV_KWARGS = {"randomization": "low"}
+DEFAULT_ENV_KWARGS = {"randomization": "low", "num_particles": 100, "control_hz": 25.0}
 
 
 @dataclass(frozen=True)
@@ -123,9 +124,9 @@ def failure_reason(summary: Mapping[str, Any], env: Any) -> str:
     """Why a roll-out that ended did not succeed, as one of a few phrases that can be counted."""
     if summary["terminated"]:
         return "stopped early"
-    if summary["spilled_fraction"] > getattr(env, "max_spilled_fraction", 0.1):
+    if summary["spilled_fraction"] > getattr(env, "success_spilled_fraction", 0.1):
         return "spilled too much"
-    if summary["poured_fraction"] < getattr(env, "min_poured_fraction", 0.7):
+    if summary["poured_fraction"] < getattr(env, "success_poured_fraction", 0.7):
         return "poured too little"
     return "no success at the end"
 

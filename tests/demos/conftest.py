@@ -18,8 +18,8 @@ STEPS = 6
 class StandInEnv(gymnasium.Env[Any, Any]):
     metadata = {"render_modes": ["rgb_array"], "render_fps": 25}  # noqa: RUF012  (Gymnasium's own form)
     constructed = 0
-    min_poured_fraction = 0.7
-    max_spilled_fraction = 0.1
+    success_poured_fraction = 0.7
+    success_spilled_fraction = 0.1
 
     def __init__(
         self,
@@ -31,6 +31,7 @@ class StandInEnv(gymnasium.Env[Any, Any]):
         randomization: str = "none",
         success_below: float = 0.5,
         forgetful: bool = False,
+        **others: object,
     ) -> None:
         type(self).constructed += 1
         self.number = type(self).constructed
