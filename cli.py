@@ -178,11 +178,11 @@ class Retarget(Staged):
     def do(self) -> Result:
         from .run import reference_path, reference_stage, retarget_stage
 
-        chosen = {"receptacle": self.receptacle, "scale": self.scale, "seed": self.seed}
+        chosen: dict[str, Any] = {"receptacle": self.receptacle, "scale": self.scale, "seed": self.seed}
         first = reference_stage(self.track, self.receptacle_track, self.out, **chosen)
         second = retarget_stage(reference_path(self.track, self.out), self.out)
-        files = {"track": self.track, "receptacle_track": self.receptacle_track}
-        return self.do_stages([first, second], files | chosen)
+        chosen |= {"track": self.track, "receptacle_track": self.receptacle_track}
+        return self.do_stages([first, second], chosen)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -292,8 +292,7 @@ class Meshes(Command):
             return {"categories": {category: _measures(make_vessel(category)) for category in CATEGORIES}}
         if self.name is None:
             raise UserError(f"meshes {self.action} needs a category; the library has {', '.join(CATEGORIES)}")
-        category = resolve_category(self.name)[0]
-        vessel = make_vessel(category, self.seed)
+        vessel = make_vessel(category := resolve_category(self.name)[0], self.seed)
         parameters = {
             key: {"value": vessel.params[key], "low": r.low, "high": r.high, "unit": r.unit}
             for key, r in parameter_space(category).items()
@@ -330,8 +329,8 @@ class Synthesize(Staged):
     def do(self) -> Result:
         from .run import synthesize_stage
 
-        settings: dict[str, Any] = {"category": self.category, "receptacle": self.receptacle, "seed": self.seed}
-        settings |= {"seconds": self.seconds, "fps": self.fps, "size": self.size, "occluder": not self.without_hand}
+        settings = {"category": self.category, "receptacle": self.receptacle, "seed": self.seed, "size": self.size}
+        settings |= {"seconds": self.seconds, "fps": self.fps, "occluder": not self.without_hand}
         return self.do_stages([synthesize_stage(self.out, settings)], settings)
 
 
@@ -403,22 +402,17 @@ commands:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line. Returns the exit status: 0 good, 1 not all well, 2 bad input, 130 interrupted."""
     words = list(sys.argv[1:] if arguments is None else arguments)
-    if not words or words[0] in ("-h", "--help", "help"):
-        print(usage())
-        return 0 if words else 2
-    if words[0] == "--version":
-        print(f"vid2demo {__version__}")
-        return 0
     if sys.platform == "linux":
         os.environ.setdefault("MUJOCO_GL", "egl")  # no screen is needed
     try:
-        return _dispatch(words)
+        status = _dispatch(words)
+        sys.stdout.flush()
+        return status
     except UserError as error:
         print(f"vid2demo: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        again = shlex.join(["vid2demo", *words])
-        print(f"\nvid2demo: interrupted; to go on where it was, type again: {again}", file=sys.stderr)
+        print("\nvid2demo: interrupted; to go on, type again:", shlex.join(["vid2demo", *words]), file=sys.stderr)
         return 130
     except BrokenPipeError:  # the reader of our output has gone, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -426,7 +420,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _dispatch(words: list[str]) -> int:
-    name = words[0]
+    name = words[0] if words else "--help"
+    if name in ("-h", "--help", "help"):
+        print(usage())
+        return 0 if words else 2
+    if name == "--version":
+        print(f"vid2demo {__version__}")
+        return 0
     if name not in COMMANDS:
         close = difflib.get_close_matches(name, COMMANDS, n=1)
         hint = f" (did you mean {close[0]}?)" if close else ""

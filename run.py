@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from .extract.errors import UserError
 from .extract.files import sha256_of_file, write_json
 from .extract.progress import Listener, Progress
 from .extract.stages import PACKAGE_ROOT, Stage, plain, run_stages
@@ -106,7 +107,7 @@ def extract_stage(settings: RunSettings, folder: Path) -> Stage:
         plain({"objects": [asdict(o) | {"mesh": None} for o in objects], "camera": settings.camera})
         | {"seed": settings.seed},
         {"video": settings.video} | {f"mesh of {o.name}": o.mesh for o in objects if o.mesh is not None},
-        (*(f"{o.name}.track.npz" for o in objects), "overlay.mp4"),
+        (*(f"{o.name}.{kind}" for o in objects for kind in ("track.npz", "mask.png")), "overlay.mp4"),
         ("extract",),
     )
 
@@ -232,14 +233,19 @@ def report_stage(folder: Path, stages: Sequence[Stage]) -> Stage:
     return Stage("report", "write the report", work, {"report.py": code}, written, ("report.html",))
 
 
-def run(
-    settings: RunSettings, folder: Path, *, force: bool = False, listener: Listener | None = None
-) -> dict[str, Any]:
-    """The whole way from a video to a dataset and a report. Returns the content of `run.json`."""
-    name = settings.object.name
-    track = folder / f"{name}.track.npz"
-    reference = reference_path(track, folder)
+def stages_of(settings: RunSettings, folder: Path) -> list[Stage]:
+    """All stages from the video to the report, in order."""
+    names = [o.name for o in (settings.object, settings.receptacle) if o is not None]
+    for name in names:
+        if not name.strip() or Path(name).name != name or name.startswith("."):
+            raise UserError(
+                f"{name!r} cannot name an object, because its files bear that name; use a word such as kettle"
+            )
+    if len(set(names)) < len(names):
+        raise UserError(f"object and receptacle are both called {names[0]!r}; call one by another word, such as cup")
+    track = folder / f"{settings.object.name}.track.npz"
     receptacle = folder / f"{settings.receptacle.name}.track.npz" if settings.receptacle else None
+    reference = reference_path(track, folder)
     stages = [
         extract_stage(settings, folder),
         reference_stage(track, receptacle, folder, scale=settings.scale, seed=settings.seed),
@@ -247,10 +253,16 @@ def run(
         simulate_stage(reference, joints_path(track, folder), settings.video, folder),
         collect_stage(reference, folder, episodes=settings.episodes, seed=settings.seed),
     ]
-    stages.append(report_stage(folder, stages))
+    return [*stages, report_stage(folder, stages)]
+
+
+def run(
+    settings: RunSettings, folder: Path, *, force: bool = False, listener: Listener | None = None
+) -> dict[str, Any]:
+    """The whole way from a video to a dataset and a report. Returns the content of `run.json`."""
     return run_stages(
         folder,
-        stages,
+        stages_of(settings, folder),
         command="run",
         settings=settings_record(settings),
         video=video_identity(settings.video),
@@ -261,4 +273,4 @@ def run(
 
 def _stem(path: Path) -> str:
     """`kettle` of `runs/coffee/kettle.track.npz`."""
-    return path.name.split(".")[0]
+    return path.name.removesuffix(".npz").rpartition(".")[0] or path.stem

@@ -242,7 +242,24 @@ def _write(folder: Path, record: dict[str, Any]) -> None:
     done = record["stages"]
     record["timings_s"] = {name: stage["seconds"] for name, stage in done.items()}
     record["figures"] = {name: stage["figures"] for name, stage in done.items()}
-    write_json(folder / RUN_FILE, record)
+    write_json(folder / RUN_FILE, {name: record[name] for name in sorted(record, key=_place)})
+
+
+def _place(name: str) -> int:
+    """Where a reader of `run.json` looks for an entry: what was asked first, hashes last."""
+    order = (
+        "schema",
+        "version",
+        "command",
+        "video",
+        "settings",
+        "seeds",
+        "timings_s",
+        "figures",
+        "versions",
+        "machine",
+    )
+    return order.index(name) if name in order else len(order)
 
 
 @contextmanager
