@@ -49,7 +49,6 @@ class Command:
     json: Annotated[bool, told(None, "Print the result as JSON on standard output.")] = False
 
     def do(self) -> Result:
-        """Do the work; returns what is printed."""
         raise AssertionError("a command without work")
 
     def words(self, result: Result) -> str:
@@ -428,8 +427,7 @@ def _dispatch(words: list[str]) -> int:
         print(f"vid2demo {__version__}")
         return 0
     if name not in COMMANDS:
-        close = difflib.get_close_matches(name, COMMANDS, n=1)
-        hint = f" (did you mean {close[0]}?)" if close else ""
+        hint = "".join(f" (did you mean {close}?)" for close in difflib.get_close_matches(name, COMMANDS, n=1))
         raise UserError(f"unknown command {name!r}{hint}; there are {', '.join(COMMANDS)}")
     command = tyro.cli(COMMANDS[name], prog=f"vid2demo {name}", args=words[1:], config=(tyro.conf.FlagCreatePairsOff,))
     result = plain(command.do())

@@ -166,7 +166,8 @@ def retarget_stage(reference: Path, folder: Path) -> Stage:
         joints.save(output)
         findings = plain(feasibility(wanted, joints))
         write_json(folder / "feasibility.json", findings)
-        return dict(findings)
+        shown = ("feasible", "position_error_m", "rotation_error_rad", "words")
+        return {name: findings[name] for name in shown if name in findings}
 
     return Stage(
         "retarget",

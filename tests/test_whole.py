@@ -1,0 +1,75 @@
+"""The whole way on a small clip, as `make demo` goes it: every stage real."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from vid2demo import cli
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("whole") / "demo"
+    assert cli.main(demo_words(out)) == 0
+    return out
+
+
+def demo_words(out: Path, episodes: int = 2) -> list[str]:
+    return ["demo", "--out", str(out), "--seconds", "4", "--episodes", str(episodes), "--seed", "0"]
+
+
+def record(folder: Path) -> dict[str, Any]:
+    return dict(json.loads((folder / "run.json").read_text()))
+
+
+def test_every_file_is_there(folder: Path) -> None:
+    wanted = (
+        "clip/video.mp4 mug.track.npz bowl.track.npz overlay.mp4 mug.reference.npz mug.joints.npz feasibility.json "
+        "simulation.mp4 series.json dataset/meta/info.json run.json report.html"
+    )
+    assert [name for name in wanted.split() if not (folder / name).is_file()] == []
+    assert not [p.name for p in folder.iterdir() if p.name.startswith(".")]
+
+
+def test_the_robot_pours_and_follows(folder: Path) -> None:
+    figures = record(folder)["figures"]
+    assert figures["simulate"]["poured_fraction"] >= 0.6
+    assert figures["simulate"]["position_error_m"]["mean"] < 0.01
+    assert figures["retarget"]["feasible"]
+
+
+def test_the_report_needs_no_other_file(folder: Path) -> None:
+    page = (folder / "report.html").read_text()
+    assert 'src="http' not in page
+    assert "data:video/mp4;base64," in page
+
+
+def test_every_episode_replays_to_the_same_end(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["replay", str(folder / "dataset"), "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert (result["same_end"], result["episodes"]) == (2, 2)
+
+
+def test_the_same_command_again_does_nothing(folder: Path) -> None:
+    def stamps() -> dict[str, int]:
+        return {str(p): p.stat().st_mtime_ns for p in folder.rglob("*") if p.is_file() and p.name != "run.json"}
+
+    before, record_before = stamps(), record(folder)
+    assert cli.main(demo_words(folder)) == 0
+    assert stamps() == before
+    assert record(folder) == record_before
+
+
+def test_a_lost_file_is_made_again_and_nothing_else(folder: Path) -> None:
+    finished = {name: stage["finished"] for name, stage in record(folder)["stages"].items()}
+    content = (folder / "mug.joints.npz").read_bytes()
+    (folder / "mug.joints.npz").unlink()
+    assert cli.main(demo_words(folder)) == 0
+    assert (folder / "mug.joints.npz").read_bytes() == content
+    after = {name: stage["finished"] for name, stage in record(folder)["stages"].items()}
+    assert {name for name in after if after[name] != finished[name]} <= {"retarget"}
