@@ -35,7 +35,9 @@ WOOD: Color = (0.55, 0.36, 0.20, 1.0)
 
 # The cavity is cut a little beyond the rim so that no face of it coincides with the rim's.
 OVERCUT_M = 0.002
-PROFILE_TOLERANCE_M = 3e-5
+# Profiles keep this close to their smooth shape; thin walls ask for less.
+PROFILE_TOLERANCE_M = 1e-4
+LIP_LEVELS: Array = np.linspace(0.1, 1.0, 9, dtype=np.float64)
 
 
 @dataclass(frozen=True)
@@ -126,9 +128,10 @@ def round_walls(
     else:
         outer = round_off(outer, base_round_m, min(0.001, 0.5 * wall_m))
         inner = round_off(inner, fillet, 0.0)
-    outer, inner = simplified(outer, PROFILE_TOLERANCE_M), simplified(inner, PROFILE_TOLERANCE_M)
+    tolerance = min(PROFILE_TOLERANCE_M, 0.05 * wall_m)
+    outer, inner = simplified(outer, tolerance), simplified(inner, tolerance)
     if lip is not None:
-        outer, inner = (with_levels(p, top_m - lip.depth_m * np.linspace(0.1, 1, 9)) for p in (outer, inner))
+        outer, inner = (with_levels(p, top_m - lip.depth_m * LIP_LEVELS) for p in (outer, inner))
     return Walls(outer, inner, wall_m, ceiling_m is None, lip=lip, sides=sides)
 
 

@@ -1,4 +1,4 @@
-"""Vessels that pour through a spout: kettles, pots, cans. Each function drafts one category from its parameters."""
+"""Kettles: gooseneck, stovetop, electric. Each function drafts one category from its parameters."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from .geometry import Array
 from .vessel_assembly import (
     BLACK,
     PLASTIC_KG_M3,
@@ -16,11 +17,12 @@ from .vessel_assembly import (
     body_grasp,
     handle_grasp,
     knob,
+    loop_handle,
     round_walls,
     spout,
 )
-from .vessel_shapes import lofted, rounded_path, tube
-from .vessel_types import Color, Range
+from .vessel_shapes import cumulative_share, lofted, rounded_path, smooth_profile, tube
+from .vessel_types import Color, GraspRegion, Range
 
 Params = Mapping[str, float]
 
@@ -112,8 +114,7 @@ def gooseneck_kettle(p: Params, rgba: Color) -> Draft:
     stick = [(x_bend - 0.45 * horn, z_stub + horn), (x_bend, z_stub)] if horn > 0.004 else [(x_bend, z_stub)]
     stick_path = np.array([*stick, (x_low, z_low)])
     grip_path = rounded_path(stick_path, 0.03, steps=8) if len(stick_path) > 2 else stick_path
-    share = np.linspace(0, 1, len(grip_path))
-    grip = tube(grip_path, grip_r * (1.05 - 0.2 * share), dome=0.35)
+    grip = tube(grip_path, grip_r * (1.05 - 0.2 * cumulative_share(grip_path)), dome=0.35)
     x_in = -(walls.inner_radius(z_stub) - 0.004)
     x_metal = x_body - 0.3 * p["handle_gap_m"]
     stub = Part(tube(np.array([[x_in, z_stub], [x_metal - 0.002, z_stub]]), 0.9 * grip_r), STEEL)
@@ -138,5 +139,140 @@ def gooseneck_kettle(p: Params, rgba: Color) -> Draft:
             knob(h - recess, 0.42 * lid_r, recess + p["lid_height_m"], BLACK),
         ],
         dents=[Part(lofted(recess_profile), BLACK)],
+        cuts=[channel],
+    )
+
+
+STOVETOP_KETTLE = {
+    "height_m": Range(0.09, 0.17, 0.120),
+    "radius_m": Range(0.07, 0.12, 0.095),
+    "base_ratio": Range(0.75, 1.0, 0.90, "1"),
+    "belly_height": Range(0.15, 0.4, 0.25, "1"),
+    "lid_ratio": Range(0.35, 0.6, 0.46, "1"),
+    "wall_m": Range(0.0006, 0.002, 0.001),
+    "spout_height": Range(0.35, 0.6, 0.48, "1"),
+    "spout_length_m": Range(0.035, 0.08, 0.055),
+    "spout_tilt_rad": Range(0.5, 1.1, 0.80, "rad"),
+    "spout_radius_m": Range(0.010, 0.02, 0.015),
+    "spout_taper": Range(0.55, 1.0, 0.75, "1"),
+    "handle_height_m": Range(0.06, 0.12, 0.085),
+    "handle_radius_m": Range(0.005, 0.011, 0.008),
+    "knob_radius_m": Range(0.01, 0.02, 0.015),
+}
+
+
+def stovetop_kettle(p: Params, rgba: Color) -> Draft:
+    """A squat dome with a short stout spout, a lid with a knob and a handle arched over the top."""
+    h, r, top = p["height_m"], p["radius_m"], p["lid_ratio"] * p["radius_m"]
+    belly = p["belly_height"]
+    shoulder = 0.5 * (r + top)
+    outer = smooth_profile(
+        [(0.0, p["base_ratio"] * r), (belly * h, r), ((0.62 + 0.25 * belly) * h, 0.55 * shoulder + 0.45 * r), (h, top)],
+        60,
+    )
+    walls = round_walls(
+        outer, p["wall_m"], 1.5 * p["wall_m"], base_round_m=0.006, inner_fillet_m=0.005, ceiling_m=h - 0.003
+    )
+    lid = smooth_profile([(h - 0.001, 0.94 * top), (h + 0.006, 0.85 * top), (h + 0.010, 0.35 * top)], 12)
+    root = p["spout_radius_m"]
+    z0 = p["spout_height"] * h
+    wall_x = walls.outer_radius(z0)
+    tilt, length = p["spout_tilt_rad"], p["spout_length_m"]
+    step = 0.25 * root
+    corner = np.array([wall_x - 0.3 * root, z0])
+    tip = corner + length * np.array([np.cos(tilt), np.sin(tilt)])
+    mouth = tip + np.array([step, 0.35 * step])
+    path = rounded_path(np.array([[0.0, z0], corner, tip, mouth]), [1.5 * root, step], steps=6)
+    tube_part, channel, outlet = spout(walls, path, root, p["spout_taper"] * root, max(p["wall_m"], 0.001), rgba)
+
+    grip_r = p["handle_radius_m"]
+    z_foot = 0.80 * h
+    x_foot = walls.outer_radius(z_foot) - 0.4 * grip_r
+    z_top = h + p["handle_height_m"]
+    arch = rounded_path(
+        np.array([[-x_foot, z_foot], [-1.02 * x_foot, z_top], [1.02 * x_foot, z_top], [x_foot, z_foot]]),
+        0.55 * r,
+        steps=12,
+    )
+    flat = 0.5 + 0.5 * np.clip((arch[:, 1] - z_foot) / (z_top - z_foot), 0, 1)
+    handle = tube(arch, 0.6 * grip_r * flat + 0.1 * grip_r, grip_r * flat)
+    grip = arch[np.abs(arch[:, 0]) < 0.6 * x_foot]
+    sleeve = tube(_line(grip[0], grip[-1]), 0.95 * grip_r, 1.2 * grip_r, dome=0.3)
+    over = GraspRegion(
+        "handle",
+        np.array([0.0, 0.0, float(grip[:, 1].mean())]),
+        np.array([1.0, 0.0, 0.0]),
+        float(np.ptp(grip[:, 0])),
+        2.4 * grip_r,
+        np.array([0.0, 0.0, -1.0]),
+    )
+    return Draft(
+        walls,
+        rgba,
+        STEEL_KG_M3,
+        outlet,
+        [over, body_grasp(walls, 0.1, 0.5, sideways=True)],
+        additions=[
+            tube_part,
+            Part(lofted(lid), rgba),
+            knob(h + 0.009, p["knob_radius_m"], 0.020, BLACK),
+            Part(handle, STEEL),
+            Part(sleeve, BLACK, PLASTIC_KG_M3),
+        ],
+        cuts=[channel],
+    )
+
+
+def _line(start: Array, end: Array, count: int = 8) -> Array:
+    share = np.linspace(0.0, 1.0, count)[:, None]
+    return np.asarray((1 - share) * start + share * end)
+
+
+ELECTRIC_KETTLE = {
+    "height_m": Range(0.16, 0.25, 0.205),
+    "base_radius_m": Range(0.06, 0.095, 0.078),
+    "top_ratio": Range(0.6, 0.95, 0.76, "1"),
+    "wall_m": Range(0.0008, 0.002, 0.0012),
+    "beak_out_m": Range(0.016, 0.036, 0.024),
+    "beak_radius_m": Range(0.011, 0.018, 0.014),
+    "handle_reach_m": Range(0.045, 0.075, 0.058),
+    "handle_bottom": Range(0.08, 0.4, 0.18, "1"),
+    "handle_thickness_m": Range(0.016, 0.028, 0.022),
+    "foot_m": Range(0.012, 0.03, 0.020),
+}
+
+
+def electric_kettle(p: Params, rgba: Color) -> Draft:
+    """A tall tapered body on a dark foot, a beak at the rim, a large loop handle and a flat lid."""
+    h, base, top = p["height_m"], p["base_radius_m"], p["top_ratio"] * p["base_radius_m"]
+    foot = p["foot_m"]
+    outer = smooth_profile([(0.9 * foot, base), (0.5 * h, 0.45 * base + 0.55 * top), (h, top)], 50)
+    walls = round_walls(outer, p["wall_m"], foot + p["wall_m"], inner_fillet_m=0.004, ceiling_m=h - 0.002)
+    lid = [(h - 0.002, 0.93 * top), (h + 0.008, 0.90 * top), (h + 0.012, 0.7 * top)]
+    stand, hollow = (lofted(np.array([[z, k * base], [foot, k * base]])) for z, k in ((0.0, 1.01), (-0.001, 0.94)))
+    root = p["beak_radius_m"]
+    tip = max(0.5 * root, p["wall_m"] + 0.003)
+    z0 = h - root - 0.006
+    wall_x, out = walls.outer_radius(z0), p["beak_out_m"]
+    path = np.array([[0.0, z0], [wall_x - 0.8 * root, z0], [wall_x + 0.1 * root, z0 + 0.1 * root]])
+    path = np.vstack([path, [wall_x + out, h + 0.002]])
+    path = rounded_path(path, [0.8 * root, 0.8 * root], steps=6)
+    beak, channel, outlet = spout(walls, path, root, tip, p["wall_m"], rgba, root_aspect=1.5)
+    thick = 0.5 * p["handle_thickness_m"]
+    z_top, z_low = h - thick - 0.006, max(p["handle_bottom"] * h, foot + thick)
+    x_out = -(base + p["handle_reach_m"] - thick)
+    handle, grip = loop_handle(
+        walls, [(0.0, z_top), (0.97 * x_out, z_top), (x_out, z_low), (0.0, z_low)], 0.62 * thick, thick, BLACK, 0.03
+    )
+    dark = [
+        Part(part, BLACK, PLASTIC_KG_M3) for part in (stand - hollow, handle.solid, lofted(smooth_profile(lid, 10)))
+    ]
+    return Draft(
+        walls,
+        rgba,
+        STEEL_KG_M3,
+        outlet,
+        [grip, body_grasp(walls, 0.4, 0.9, sideways=True)],
+        additions=[beak, *dark],
         cuts=[channel],
     )

@@ -9,14 +9,17 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import manifold3d
-from manifold3d import Manifold as Solid
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
 from .geometry import Array
 from .vessel_types import section_outlines
+
+# A plain alias, since a `type` statement would hide the class's methods.
+Solid: TypeAlias = manifold3d.Manifold  # noqa: UP040
 
 SEGMENTS = 64
 TUBE_SEGMENTS = 24
@@ -40,7 +43,7 @@ class Lip:
 
     def volume_m3(self, z_m: Array, radius_m: Array, rim_m: float) -> float:
         """Volume that the lip adds to a round interior, by integration over the height."""
-        z = np.linspace(rim_m - self.depth_m, rim_m, 400)
+        z: Array = np.linspace(rim_m - self.depth_m, rim_m, 400, dtype=np.float64)
         pull = self.reach_m * self.rise(z, rim_m)
         # The angular shape is cos^2, whose integral is a and that of its square 3a/4 over [-a, a].
         area = self.half_angle_rad * (np.interp(z, z_m, radius_m) * pull + 0.375 * pull**2)
@@ -113,7 +116,7 @@ def simplified(profile: Array, tolerance_m: float) -> Array:
         if distance[worst] > tolerance_m:
             keep[a + 1 + worst] = True
             stack += [(a, a + 1 + worst), (a + 1 + worst, b)]
-    return profile[keep]
+    return np.asarray(profile[keep])
 
 
 def eroded(outer: Array, wall_m: float, floor_z_m: float, top_z_m: float) -> Array:

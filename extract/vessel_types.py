@@ -50,7 +50,7 @@ class Section:
 
     def outline(self, radius_m: float, segments: int = 64) -> Array:
         """(segments, 2) closed polygon with half extent `radius_m` along x, counter-clockwise from +x."""
-        return section_outlines(np.array([radius_m]), np.array([self.corner]), self.aspect, segments)[0]
+        return np.asarray(section_outlines(np.array([radius_m]), np.array([self.corner]), self.aspect, segments)[0])
 
 
 def section_outlines(radius_m: Array, corner: Array, aspect: float, segments: int = 64) -> Array:

@@ -9,8 +9,11 @@ from functools import lru_cache
 
 import numpy as np
 
+from . import vessel_containers as containers
 from . import vessel_cups as cups
 from . import vessel_kettles as kettles
+from . import vessel_pitchers as pitchers
+from . import vessel_pots as pots
 from .errors import UserError
 from .vessel_assembly import STEEL, Draft, assemble
 from .vessel_types import Color, GraspRegion, Outlet, Profile, Range, Section, Vessel
@@ -36,6 +39,11 @@ Palette = tuple[tuple[float, float, float], ...]
 CERAMIC: Palette = ((0.93, 0.92, 0.89), (0.70, 0.16, 0.13), (0.16, 0.30, 0.52), (0.20, 0.42, 0.33), (0.85, 0.66, 0.25))
 METAL: Palette = (STEEL[:3], (0.12, 0.12, 0.13), (0.72, 0.45, 0.30), (0.92, 0.92, 0.90))
 
+GLASS: Palette = ((0.78, 0.87, 0.90), (0.62, 0.74, 0.70), (0.80, 0.80, 0.78))
+PLASTIC: Palette = ((0.20, 0.45, 0.35), (0.15, 0.32, 0.60), (0.80, 0.24, 0.20), (0.90, 0.88, 0.82), (0.93, 0.72, 0.20))
+BOTTLES: Palette = ((0.16, 0.30, 0.18), (0.30, 0.18, 0.09), (0.75, 0.84, 0.86))
+CARTONS: Palette = ((0.90, 0.91, 0.93), (0.93, 0.62, 0.20), (0.35, 0.58, 0.80))
+
 
 @dataclass(frozen=True)
 class Entry:
@@ -48,10 +56,31 @@ class Entry:
 
 
 _LIBRARY: dict[str, Entry] = {
-    "mug": Entry(cups.MUG, cups.mug, ((0.10, 0.35, 0.72), *CERAMIC), ("coffee mug",)),
+    "mug": Entry(cups.MUG, cups.mug, ((0.10, 0.35, 0.72), *CERAMIC), ("coffee mug", "beaker mug")),
+    "cup": Entry(cups.CUP, cups.cup, CERAMIC, ("teacup", "tea cup", "coffee cup")),
+    "tumbler": Entry(cups.TUMBLER, cups.tumbler, GLASS, ("glass", "drinking glass", "water glass")),
+    "wine_glass": Entry(cups.WINE_GLASS, cups.wine_glass, GLASS, ("glass", "goblet", "wineglass")),
+    "bowl": Entry(cups.BOWL, cups.bowl, CERAMIC, ("dish", "ramekin")),
     "gooseneck_kettle": Entry(
-        kettles.GOOSENECK_KETTLE, kettles.gooseneck_kettle, METAL, ("kettle", "pour-over kettle", "coffee kettle")
+        kettles.GOOSENECK_KETTLE, kettles.gooseneck_kettle, METAL, ("kettle", "pour over kettle", "coffee kettle")
     ),
+    "stovetop_kettle": Entry(kettles.STOVETOP_KETTLE, kettles.stovetop_kettle, METAL, ("kettle", "tea kettle")),
+    "electric_kettle": Entry(kettles.ELECTRIC_KETTLE, kettles.electric_kettle, METAL, ("kettle", "water kettle")),
+    "teapot": Entry(pots.TEAPOT, pots.teapot, CERAMIC, ("tea pot", "pot")),
+    "moka_pot": Entry(pots.MOKA_POT, pots.moka_pot, METAL, ("moka", "coffee pot", "espresso pot", "pot")),
+    "saucepan": Entry(pots.SAUCEPAN, pots.saucepan, METAL, ("pan", "pot", "sauce pan")),
+    "watering_can": Entry(pots.WATERING_CAN, pots.watering_can, PLASTIC, ("can",)),
+    "jug": Entry(pitchers.JUG, pitchers.jug, CERAMIC, ("ewer", "milk pitcher")),
+    "pitcher": Entry(pitchers.PITCHER, pitchers.pitcher, PLASTIC, ("jug", "water jug")),
+    "milk_jug": Entry(pitchers.MILK_JUG, pitchers.milk_jug, METAL, ("jug", "creamer", "milk pitcher")),
+    "carafe": Entry(pitchers.CARAFE, pitchers.carafe, GLASS, ("decanter",)),
+    "measuring_cup": Entry(pitchers.MEASURING_CUP, pitchers.measuring_cup, GLASS, ("measuring jug", "measure")),
+    "beaker": Entry(pitchers.BEAKER, pitchers.beaker, GLASS, ("laboratory beaker", "lab beaker")),
+    "bottle": Entry(containers.BOTTLE, containers.bottle, BOTTLES, ("wine bottle", "water bottle", "flask")),
+    "thermos": Entry(containers.THERMOS, containers.thermos, PLASTIC, ("flask", "vacuum flask", "thermos flask")),
+    "can": Entry(containers.CAN, containers.can, (STEEL[:3], (0.80, 0.68, 0.40)), ("tin", "tin can", "food can")),
+    "carton": Entry(containers.CARTON, containers.carton, CARTONS, ("milk carton", "juice carton", "box")),
+    "vase": Entry(containers.VASE, containers.vase, CERAMIC, ("flower vase",)),
 }
 _COLOR_RANGES = ("red", "green", "blue")
 CATEGORIES: tuple[str, ...] = tuple(_LIBRARY)
