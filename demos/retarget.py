@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import mink
 import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..envs.kinematics import HAND_BODY, limit_margin_rad, panda_chain, pose_error
-from ..envs.panda import ARM_JOINTS, DQ_MAX_RAD_S, FINGER_JOINTS, FINGER_MAX_M, Q_MAX_RAD, Q_MIN_RAD, panda_spec
+from ..envs.panda import DQ_MAX_RAD_S, FINGER_JOINTS, FINGER_MAX_M, Q_MAX_RAD, Q_MIN_RAD, panda_spec
 from ..extract.errors import UserError
 from ..extract.geometry import Array
 from .joints import JointTrajectory
@@ -25,7 +26,7 @@ LOST_M, LOST_RAD = 0.03, np.deg2rad(10.0)
 LIMIT_DISTANCE_RAD = 0.01
 # The redundancy stays near the start posture; so weak that it costs less than 0.01 mm of tracking.
 _POSTURE_COST = 1e-3
-_SUBSTEPS = 3
+_ITERATIONS = 3
 
 
 def retarget(reference: Reference, *, contents_kg: float = 0.0, strict: bool = True) -> JointTrajectory:
@@ -102,7 +103,7 @@ def _model_with_vessel(reference: Reference, contents_kg: float) -> Any:
 
 
 def _inertia(vessel: Vessel | None, contents_kg: float) -> tuple[float, Array, Array]:
-    """Mass, centre and principal inertia. A box's inertia stands for the vessel's: beside the arm's it hardly matters."""
+    """Mass, centre and principal inertia. A box's inertia stands for the vessel's, a small part of the arm's."""
     if vessel is None:
         return max(contents_kg, 1e-3), np.zeros(3), np.full(3, 1e-6)
     mass = float(vessel.mass_kg) + contents_kg
@@ -111,9 +112,26 @@ def _inertia(vessel: Vessel | None, contents_kg: float) -> tuple[float, Array, A
     return mass, center, mass / 8.0 * np.array([b * b + c * c, a * a + c * c, a * a + b * b])
 
 
-def _follow_with_mink(model: Any, reference: Reference) -> Array:
-    import mink
+class KnotSpeedLimit(mink.Limit):
+    """Keeps the iterations of one knot together within what the joints can travel since the knot before.
 
+    mink's own VelocityLimit bounds each iteration alone: divided among them it would bind the first, large one far
+    below the true limit and push the redundancy about.
+    """
+
+    def __init__(self, travel_rad: Array, dof_count: int) -> None:
+        """travel_rad: (7,) largest travel of each joint between two knots."""
+        self.travel_rad = travel_rad
+        self.q_before_rad: Array = np.zeros(7)
+        self._select = np.eye(dof_count)[:7]
+
+    def compute_qp_inequalities(self, configuration: Any, dt: float) -> Any:
+        moved = configuration.q[:7] - self.q_before_rad
+        bound = np.maximum(np.hstack([self.travel_rad - moved, self.travel_rad + moved]), 0.0)
+        return mink.Constraint(G=np.vstack([self._select, -self._select]), h=bound)
+
+
+def _follow_with_mink(model: Any, reference: Reference) -> Array:
     # The fingers play no part; half open they are as far from their own limits as they can be.
     q = np.full(model.nq, 0.5 * FINGER_MAX_M)
     q[:7] = np.clip(reference.q_start_rad, Q_MIN_RAD + LIMIT_DISTANCE_RAD, Q_MAX_RAD - LIMIT_DISTANCE_RAD)
@@ -123,22 +141,20 @@ def _follow_with_mink(model: Any, reference: Reference) -> Array:
     posture.set_target(q)
     fingers = mink.DofFreezingTask(model, [int(model.joint(name).dofadr[0]) for name in FINGER_JOINTS])
     joint_limit = mink.ConfigurationLimit(model, gain=0.95, min_distance_from_limits=LIMIT_DISTANCE_RAD)
-    speeds = {name: float(v) for name, v in zip(ARM_JOINTS, DQ_MAX_RAD_S, strict=True)}
-    speed_limit = mink.VelocityLimit(model, speeds)
+    speed_limit = KnotSpeedLimit(DQ_MAX_RAD_S / reference.control_hz, model.nv)
 
-    def approach(T: Array, iterations: int, dt: float, limits: list[Any]) -> None:
+    def approach(T: Array, iterations: int, limits: list[Any]) -> None:
         task.set_target(mink.SE3.from_matrix(T))
         for _ in range(iterations):
-            v = mink.solve_ik(configuration, [task, posture], dt, "daqp", limits=limits, constraints=[fingers])
-            configuration.integrate_inplace(v, dt)
+            v = mink.solve_ik(configuration, [task, posture], 1.0, "daqp", limits=limits, constraints=[fingers])
+            configuration.integrate_inplace(v, 1.0)
 
     out = np.empty((len(reference), 7))
     # Before the motion there is no clock: the arm is simply put where the object starts.
-    approach(reference.T_world_object[0], 20, 1.0, [joint_limit])
+    approach(reference.T_world_object[0], 20, [joint_limit])
     posture.set_target(configuration.q)
-    dt = 1.0 / reference.control_hz
     for k, T in enumerate(reference.T_world_object):
-        # Substeps share the knot's time, so that together they keep to the speed limit.
-        approach(T, _SUBSTEPS, dt / _SUBSTEPS, [joint_limit, speed_limit])
+        speed_limit.q_before_rad = configuration.q[:7].copy()
+        approach(T, _ITERATIONS, [joint_limit, speed_limit])
         out[k] = configuration.q[:7]
     return out

@@ -62,7 +62,7 @@ def build_reference(
     control_hz: float = 25.0,
     scale: float | Literal["auto"] = "auto",
     elevation_deg: float = 30.0,
-    gravity_tolerance_deg: float = 25.0,
+    gravity_tolerance_deg: float = 35.0,
     vessel: Vessel | None = None,
     receptacle: Vessel | None = None,
     seed: int = 0,
@@ -170,8 +170,8 @@ def _upright(
     if np.rad2deg(off_rad) <= tolerance_deg:
         R_up_camera = _least_rotation(R_up_camera @ axis) @ R_up_camera
         notes.append(
-            f"The vessel stands upright at first, so the camera looks down by {camera_elevation_deg(R_up_camera):.0f} "
-            f"degrees (assumed: {elevation_deg:.0f})."
+            f"The vessel stands upright at first, so the camera looks down by "
+            f"{round(camera_elevation_deg(R_up_camera))} degrees (assumed: {elevation_deg:.0f})."
         )
     else:
         notes.append(
@@ -243,14 +243,14 @@ def _make_stage(
     notes: list[str] = []
     T = seen.T_object.copy()
     deepest = int(np.argmax(tilt_rad(T)))
+    seen_start_m = float(T[0, 2, 3]) - bottom_m(vessel)
     T[:, :3, 3] = T[deepest, :3, 3] + factor * (T[:, :3, 3] - T[deepest, :3, 3])
     tracked = seen.T_receptacle
-    base_m, held_high_m = 0.0, 0.0
+    base_m = 0.0
     if tracked is not None:
         tracked = _along_ray(tracked, T, vessel, receptacle, seen)
         # Heights mean something only once the receptacle is at the depth of the jet.
-        start_bottom = float(T[0, 2, 3]) - bottom_m(vessel)
-        held_high_m = start_bottom - (float(tracked[2, 3]) - bottom_m(receptacle))
+        held_high_m = seen_start_m - (float(tracked[2, 3]) - bottom_m(receptacle))
         base_m = held_high_m if held_high_m > _SAME_TABLE_M else 0.0
     lowest = _lowest_m(T, vessel)
     # The path's lowest point stands on the table, or the start as high above it as it was seen.

@@ -29,6 +29,8 @@ POSITION_TOLERANCE_M, ROTATION_TOLERANCE_RAD = 1e-3, np.deg2rad(0.5)
 _TCP_TO_WRIST_M, _WRIST_REACH_M, _WRIST_NEAR_M = 0.2104, 0.79, 0.2
 _SHOULDER = np.array([0.0, 0.0, 0.333])
 _TABLE_CLEARANCE_M = 0.01
+# Where people look for the pour, and cameras are aimed: straight in front, within easy reach.
+_CENTRE_M = np.array([0.5, 0.0])
 _KNOTS, _SCREENED, _CHAINED = 12, 3000, 1200
 _HAND_CORNERS = np.array(list(itertools.product((-0.032, 0.032), (-0.102, 0.102), (-0.14, -0.045))))
 
@@ -112,9 +114,9 @@ def search_placement(stage: Stage, rng: np.random.Generator, *, thorough: bool =
         bad = missing > POSITION_TOLERANCE_M
         times = stage.time_s[knots][bad] if bad.any() else stage.time_s[knots][[pour]]
         return Shortfall(float(times.min()), float(times.max()), float(missing.max()))
-    cost = _costs(batch, q, grasps, stage.time_s[knots])
+    cost = _costs(stage, batch, q, grasps, stage.time_s[knots])
     if thorough:
-        batch, q, cost = _refine(batch, q, cost, T_hand, grasps, stage.time_s[knots], pour, rng)
+        batch, q, cost = _refine(stage, batch, q, cost, T_hand, grasps, knots, pour, rng)
     return _best_in_full(stage, batch, q, cost, grasps, knots, pour, tries=24 if thorough else 4, collide=thorough)
 
 
@@ -164,11 +166,11 @@ def _screen(
     )
     turned, placed, held = np.nonzero(fits)
     liking = np.array([grasps[i].cost for i in usable])[held] + 0.15 * np.abs(yaws[turned]) / np.pi
-    liking += np.abs(far[fits] - 0.6) + 0.3 * rng.random(len(turned))
-    order = np.argsort(liking)[:_SCREENED]
-    turned, placed, held = turned[order], placed[order], held[order]
     xy = place[placed] - np.einsum("mij,j->mi", turn[turned], anchor)
-    return _Batch(np.asarray(yaws[turned], float), xy, usable[held].astype(np.int64)), shortfall
+    batch = _Batch(np.asarray(yaws[turned], float), xy, usable[held].astype(np.int64))
+    liking += np.abs(far[fits] - 0.6) + 0.3 * rng.random(len(turned))
+    liking += np.linalg.norm(_pour_xy_m(stage, batch) - _CENTRE_M, axis=1)
+    return batch.take(np.argsort(liking)[:_SCREENED].astype(np.int64)), shortfall
 
 
 def _targets(batch: _Batch, T_hand: Array, knot: int) -> Array:
@@ -216,7 +218,7 @@ def _chain(batch: _Batch, q_pour: Array, T_hand: Array, pour: int) -> tuple[_Bat
     return batch.take(index.astype(np.int64)), q[index], best
 
 
-def _costs(batch: _Batch, q: Array, grasps: list[Grasp], time_s: Array) -> Array:
+def _costs(stage: Stage, batch: _Batch, q: Array, grasps: list[Grasp], time_s: Array) -> Array:
     """(C,) how little each solution is liked: limits, singularities and speed first, then looks."""
     count = q.shape[1]
     margin = limit_margin_rad(q).min(axis=(1, 2))
@@ -230,16 +232,25 @@ def _costs(batch: _Batch, q: Array, grasps: list[Grasp], time_s: Array) -> Array
         + 3.0 * away
         + np.array([grasps[i].cost for i in batch.grasp])
         + 0.15 * np.abs(batch.yaw_rad) / np.pi
+        + np.linalg.norm(_pour_xy_m(stage, batch) - _CENTRE_M, axis=1)
     )
 
 
+def _pour_xy_m(stage: Stage, batch: _Batch) -> Array:
+    """(M, 2) where the receptacle, or else the vessel at its greatest tilt, comes to stand."""
+    T = stage.T_receptacle
+    point = stage.T_object[int(np.argmax(tilt_rad(stage.T_object))), :, 3] if T is None else T[:, 3]
+    return np.asarray((batch.transforms() @ point)[:, :2])
+
+
 def _refine(
+    stage: Stage,
     batch: _Batch,
     q: Array,
     cost: Array,
     T_hand: Array,
     grasps: list[Grasp],
-    time_s: Array,
+    knots: NDArray[np.int64],
     pour: int,
     rng: np.random.Generator,
 ) -> tuple[_Batch, Array, Array]:
@@ -253,7 +264,7 @@ def _refine(
             batch.grasp[parent],
         )
         tried, q_tried, _ = _chain(tried, q[parent, pour], T_hand, pour)
-        cost = np.concatenate([cost, _costs(tried, q_tried, grasps, time_s)])
+        cost = np.concatenate([cost, _costs(stage, tried, q_tried, grasps, stage.time_s[knots])])
         q = np.concatenate([q, q_tried])
         batch = _Batch(
             np.concatenate([batch.yaw_rad, tried.yaw_rad]),
@@ -283,7 +294,7 @@ def _best_in_full(
     towards, _ = follow(T_stage, stage.T_object, T_object_hand, q[chosen_index, pour], knots[pour], Q_HOME_RAD, 0.05)
     q_start, _ = solve_ik(T_stage @ stage.T_object[0] @ T_object_hand, towards[:, 0], iterations=10, damping=0.005)
     q_full, miss = follow(T_stage, stage.T_object, T_object_hand, q_start, 0, q_start, 1.0)
-    full_cost = _costs(chosen, q_full, grasps, stage.time_s)
+    full_cost = _costs(stage, chosen, q_full, grasps, stage.time_s)
     reached = miss.max(axis=1) < POSITION_TOLERANCE_M + 0.2 * ROTATION_TOLERANCE_RAD
     fallback: Placement | None = None
     for rank in [int(i) for i in np.argsort(full_cost) if reached[i]]:

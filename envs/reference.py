@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, RotationSpline, Slerp
 
 from ..extract.errors import UserError
 from ..extract.files import atomic_path
@@ -195,7 +196,7 @@ class Reference:
             return self
         knots = max(2, round(self.duration_s * factor * self.control_hz) + 1)
         position = np.linspace(0.0, self.duration_s, knots) + self.time_s[0]
-        T = interpolate_poses(self.T_world_object, self.time_s, position)
+        T = spline_poses(self.T_world_object, self.time_s, position)
         header = {**self.header, "time_stretch": float(self.header.get("time_stretch", 1.0)) * factor}
         return Reference.from_poses(
             T,
@@ -278,6 +279,15 @@ def interpolate_poses(T: Array, time_s: Array, at_s: Array) -> Array:
     out[:, :3, :3] = Slerp(time_s, Rotation.from_matrix(T[:, :3, :3]))(at_s).as_matrix()
     for axis in range(3):
         out[:, axis, 3] = np.interp(at_s, time_s, T[:, axis, 3])
+    return out
+
+
+def spline_poses(T: Array, time_s: Array, at_s: Array) -> Array:
+    """Poses (M, 4, 4) on cubic splines in position and rotation: a robot needs a continuous velocity."""
+    at_s = np.clip(at_s, time_s[0], time_s[-1])
+    out = np.tile(np.eye(4), (len(at_s), 1, 1))
+    out[:, :3, 3] = CubicSpline(time_s, T[:, :3, 3], bc_type="natural")(at_s)
+    out[:, :3, :3] = RotationSpline(time_s, Rotation.from_matrix(T[:, :3, :3]))(at_s).as_matrix()
     return out
 
 

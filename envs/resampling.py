@@ -10,13 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
-from scipy.spatial.transform import Rotation, RotationSpline
 
 from ..extract.errors import UserError
 from ..extract.geometry import Array, rotation_angle_rad
 from ..extract.track import ObjectTrack
-from .reference import interpolate_poses
+from .reference import interpolate_poses, spline_poses
 
 Mask = NDArray[np.bool_]
 
@@ -79,7 +77,7 @@ def resample_track(
     video_time_s = _video_clock(T, time_s, control_hz, hold_s, ease_s, notes)
     confidence = np.where(good, track.confidence[inside], 0.0)
     return ResampledTrack(
-        _spline(T, time_s, video_time_s), video_time_s, np.interp(video_time_s, time_s, confidence), notes
+        spline_poses(T, time_s, video_time_s), video_time_s, np.interp(video_time_s, time_s, confidence), notes
     )
 
 
@@ -175,11 +173,3 @@ def _video_clock(T: Array, time_s: Array, control_hz: float, hold_s: float, ease
     falling = duration_s - advance(total_s - hold_s - t, eases_s[1])
     clock_s = np.where(rising < 0.5 * duration_s, rising, falling)
     return np.asarray(time_s[0] + np.clip(clock_s, 0.0, duration_s))
-
-
-def _spline(T: Array, time_s: Array, at_s: Array) -> Array:
-    """Cubic splines through the frames in position and rotation: the robot needs a continuous velocity."""
-    out = np.tile(np.eye(4), (len(at_s), 1, 1))
-    out[:, :3, 3] = CubicSpline(time_s, T[:, :3, 3], bc_type="natural")(at_s)
-    out[:, :3, :3] = RotationSpline(time_s, Rotation.from_matrix(T[:, :3, :3]))(at_s).as_matrix()
-    return out
