@@ -40,8 +40,8 @@ def library_table() -> list[dict[str, Any]]:
 def export_vessel(vessel: Vessel, path: Path) -> None:
     """Write the mesh in metres as GLB, OBJ, STL or PLY by the suffix, with the colours of its parts.
 
-    GLB, whose axes are fixed with y up, stores the z-up mesh under a rotation, so that viewers show it upright.
-    OBJ and STL are z up. STL carries no colour.
+    Every file keeps the vessel's own axes, z up, so that reading it back gives the same frame; viewers that take
+    GLB for y up show it lying. STL carries no colour.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -74,14 +74,15 @@ def _glb_bytes(vessel: Vessel) -> bytes:
     """GLB with one primitive and material per part colour."""
     import trimesh
 
-    y_up = np.array([[1.0, 0, 0, 0], [0, 0, 1.0, 0], [0, -1.0, 0, 0], [0, 0, 0, 1.0]])
-    scene = trimesh.Scene()
+    # Through Any, since these parts of trimesh carry no types.
+    visual: Any = trimesh.visual
+    scene: Any = trimesh.Scene()
     for index, (color, part) in enumerate(colored_parts(vessel)):
-        material = trimesh.visual.material.PBRMaterial(
+        material = visual.material.PBRMaterial(
             name=f"{vessel.category}_{index}", baseColorFactor=color, metallicFactor=0.0, roughnessFactor=0.5
         )
-        part.visual = trimesh.visual.TextureVisuals(material=material)
-        scene.add_geometry(part, node_name=f"{vessel.category}_{index}", geom_name=f"part_{index}", transform=y_up)
+        part.visual = visual.TextureVisuals(material=material)
+        scene.add_geometry(part, node_name=f"{vessel.category}_{index}", geom_name=f"part_{index}")
     data: bytes = scene.export(file_type="glb")
     return data
 
