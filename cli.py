@@ -70,15 +70,11 @@ class Staged(Command):
     def do_stages(
         self, stages: Sequence[Stage], settings: Mapping[str, Any], video: Mapping[str, Any] | None = None
     ) -> Result:
-        return run_stages(
-            self.out,
-            stages,
-            command=type(self).__name__.lower(),
-            settings=plain(settings),
-            video=video,
-            force=self.force,
-            listener=Terminal(),
+        command, told = type(self).__name__.lower(), plain(settings)
+        record = run_stages(
+            self.out, stages, command=command, settings=told, video=video, force=self.force, listener=Terminal()
         )
+        return record | {"stages": {stage.name: record["stages"][stage.name] for stage in stages}}
 
     def words(self, result: Result) -> str:
         text = [line for stage in result["stages"].values() for line in _lines(stage["figures"])]
@@ -439,7 +435,9 @@ def _lines(value: Mapping[str, Any], depth: int = 0) -> list[str]:
     lines = []
     for key, item in value.items():
         name = "  " * depth + key.replace("_", " ")
-        if isinstance(item, dict) and len(item) < 6 and not any(isinstance(v, (dict, list)) for v in item.values()):
+        if item in ({}, [], None):
+            lines.append(f"{name}: none")
+        elif isinstance(item, dict) and len(item) < 6 and not any(isinstance(v, (dict, list)) for v in item.values()):
             lines.append(f"{name}: {', '.join(_lines(item))}")
         elif isinstance(item, dict):
             lines += [name, *_lines(item, depth + 1)]

@@ -13,6 +13,8 @@ from .extract.files import sha256_of_file, write_json
 from .extract.progress import Listener, Progress
 from .extract.stages import PACKAGE_ROOT, Stage, plain, run_stages
 
+_ALL = ("extract", "envs", "demos")
+
 
 @dataclass(frozen=True)
 class ObjectSettings:
@@ -138,7 +140,6 @@ def reference_stage(
             "duration_s": reference.duration_s,
             "scale": reference.scale,
             "largest_tilt_deg": math.degrees(float(reference.tilt_rad.max())),
-            "notes": reference.notes,
         }
 
     return Stage(
@@ -176,7 +177,7 @@ def retarget_stage(reference: Path, folder: Path) -> Stage:
         {},
         {"reference": reference},
         (output.name, "feasibility.json"),
-        ("extract", "envs", "demos"),
+        _ALL,
     )
 
 
@@ -197,7 +198,7 @@ def simulate_stage(reference: Path, joints: Path, video: Path | None, folder: Pa
         {},
         {"reference": reference, "joints": joints} | ({"video": video} if video else {}),
         ("simulation.mp4", "series.json"),
-        ("extract", "envs", "demos"),
+        _ALL,
     )
 
 
@@ -216,7 +217,7 @@ def collect_stage(reference: Path, folder: Path, *, episodes: int, seed: int) ->
         {"episodes": episodes, "seed": seed},
         {"reference": reference},
         ("dataset",),
-        ("extract", "envs", "demos"),
+        _ALL,
     )
 
 
@@ -231,7 +232,7 @@ def report_stage(folder: Path, stages: Sequence[Stage]) -> Stage:
 
     written = {f"{stage.name} output {name}": folder / name for stage in stages for name in stage.outputs}
     code = sha256_of_file(PACKAGE_ROOT / "report.py")
-    return Stage("report", "write the report", work, {"report.py": code}, written, ("report.html",))
+    return Stage("report", "write the report", work, {"report.py": code}, written, ("report.html",), _ALL)
 
 
 def stages_of(settings: RunSettings, folder: Path) -> list[Stage]:
