@@ -1,0 +1,217 @@
+"""The liquid: spheres that slide without friction; how they are laid into a vessel, counted, and led through a spout.
+
+Each particle is a body at the world's origin on three slide joints, so its joint positions are its world position.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from ..extract.errors import UserError
+from ..extract.geometry import Array
+from .vessel_geometry import Box, Cavity
+
+if TYPE_CHECKING:
+    from ..extract.vessels import Vessel
+
+# Random loose packing of frictionless spheres as they settle here.
+PACKING = 0.58
+MIN_RADIUS_M, MAX_RADIUS_M = 0.0025, 0.005
+GRAVITY_M_S2 = 9.81
+# Points that stand for the hollow when the liquid's level is sought: 1 mm in 10 cm or better.
+LEVEL_SAMPLES = 2000
+
+
+@dataclass(frozen=True)
+class Liquid:
+    """What the particles are like.
+
+    radius_m: particle radius; None chooses 2.5 to 5 mm so that the particles take up a fair part of the vessel but
+        not more than half of the receptacle: ten millilitres at the bottom of a kettle would never reach its spout.
+    particle_mass_kg: mass of one particle.
+    drag_kg_s: resistance of the air, so that what was spilled comes to rest at last.
+    """
+
+    radius_m: float | None = None
+    particle_mass_kg: float = 0.0005
+    drag_kg_s: float = 0.0001
+
+    def __post_init__(self) -> None:
+        if self.radius_m is not None and not 0.002 <= self.radius_m <= 0.01:
+            raise UserError(f"liquid radius_m is {self.radius_m}; choose 0.002 to 0.01 m, or None for a fitting one")
+        if not 1e-5 <= self.particle_mass_kg <= 0.05:
+            raise UserError(f"liquid particle_mass_kg is {self.particle_mass_kg}; choose 1e-5 to 0.05 kg")
+        if not 0.0 <= self.drag_kg_s <= 0.01:
+            raise UserError(f"liquid drag_kg_s is {self.drag_kg_s}; choose 0 to 0.01 kg/s")
+
+    def radius_for(self, count: int, vessel_m3: float, receptacle_m3: float) -> float:
+        """The radius in m that `count` particles take in a vessel and a receptacle of these volumes."""
+        if self.radius_m is not None:
+            return self.radius_m
+        share_m3 = min(0.25 * vessel_m3, 0.5 * receptacle_m3) * PACKING / max(count, 1)
+        return float(np.clip((share_m3 / (4 / 3 * math.pi)) ** (1 / 3), MIN_RADIUS_M, MAX_RADIUS_M))
+
+
+def fill_positions(cavity: Cavity, boxes: list[Box], count: int, radius_m: float, name: str) -> Array:
+    """(count, 3) centres of a dense lattice from the floor upward, in the vessel's frame, clear of every wall.
+
+    Raises UserError with the number that fits when `count` is too many; `name` is the vessel's name for the message.
+    """
+    if count == 0:
+        return np.zeros((0, 3))
+    spacing = 2.02 * radius_m
+    reach = cavity.reach_m
+    low, high = cavity.z_m[0] + 1.01 * radius_m, cavity.rim_m - radius_m
+    layers = np.arange(low, high + 1e-9, spacing * math.sqrt(2 / 3))
+    side = np.arange(-math.ceil(reach / spacing) - 1, math.ceil(reach / spacing) + 2)
+    i, j = (grid.ravel() for grid in np.meshgrid(side, side))
+    flat = spacing * np.column_stack([i + 0.5 * (j % 2), j * math.sqrt(3) / 2])
+    points = []
+    for number, z in enumerate(layers):
+        # Alternate layers sit in the hollows of the layer below.
+        shift = (number % 2) * spacing * np.array([0.5, math.sqrt(3) / 6])
+        layer = np.column_stack([flat + shift + cavity.axis_xy_m, np.full(len(flat), z)])
+        layer = layer[cavity.contains(layer)]
+        layer = layer[np.argsort(np.linalg.norm(layer[:, :2] - cavity.axis_xy_m, axis=1), kind="stable")]
+        points.append(layer)
+    candidates = np.concatenate(points) if points else np.zeros((0, 3))
+    free = np.full(len(candidates), True)
+    for box in boxes:
+        free &= box.distance_m(candidates) >= radius_m
+    candidates = candidates[free]
+    if len(candidates) < count:
+        raise UserError(
+            f"the {name} holds at most {len(candidates)} particles of {1000 * radius_m:.1f} mm radius, but "
+            f"num_particles is {count}; choose fewer or smaller ones"
+        )
+    return np.asarray(candidates[:count])
+
+
+@dataclass(frozen=True)
+class Count:
+    """Where the particles are: masks (N,) in the held vessel, in the receptacle, and lost for both."""
+
+    held: NDArray[np.bool_]
+    poured: NDArray[np.bool_]
+    spilled: NDArray[np.bool_]
+
+    @property
+    def poured_fraction(self) -> float:
+        return float(np.mean(self.poured)) if len(self.poured) else 0.0
+
+    @property
+    def spilled_fraction(self) -> float:
+        return float(np.mean(self.spilled)) if len(self.spilled) else 0.0
+
+    @property
+    def held_fraction(self) -> float:
+        return float(np.mean(self.held)) if len(self.held) else 0.0
+
+
+def count_particles(
+    points_m: Array, vessel: Cavity, T_world_vessel: Array, receptacle: Cavity, T_world_receptacle: Array
+) -> Count:
+    """Sort particles at (N, 3) in the world.
+
+    Poured: inside the receptacle's hollow. Held: inside the vessel's. Spilled: in neither and below the receptacle's
+    rim, from where nothing finds back. The rest is in flight.
+    """
+    poured = receptacle.contains((points_m - T_world_receptacle[:3, 3]) @ T_world_receptacle[:3, :3])
+    held = vessel.contains((points_m - T_world_vessel[:3, 3]) @ T_world_vessel[:3, :3]) & ~poured
+    rim = np.array([*receptacle.axis_xy_m, receptacle.rim_m])
+    rim_z = float((T_world_receptacle[:3, :3] @ rim + T_world_receptacle[:3, 3])[2])
+    return Count(held, poured, ~poured & ~held & (points_m[:, 2] < rim_z))
+
+
+class SpoutConduit:
+    """Leads particles from a spout's inner mouth to its tip, as communicating vessels would.
+
+    Real spouts are as narrow as a particle, which would jam in them. So the body is closed, and while the liquid's
+    level stands above both the channel's entry and the tip, the particle nearest the entry reappears at the tip,
+    moving along the outlet. The level is that of a liquid of the held particles' volume in the vessel as it is tilted
+    now. A particle leaves only when its place at the tip is clear: that limits the rate, keeps particles apart, and
+    makes the conduit a function of the physics state alone, so that replays and restored states agree bit by bit.
+    """
+
+    def __init__(self, vessel: Vessel, cavity: Cavity, radius_m: float) -> None:
+        outlet = vessel.outlet
+        if outlet.entry_m is None:
+            raise UserError(f"the {vessel.category}'s spout names no entry; rebuild the vessel with its channel")
+        self._cavity, self._radius_m = cavity, radius_m
+        self._entry_m, self._tip_m = np.asarray(outlet.entry_m, float), np.asarray(outlet.point_m, float)
+        self._direction = np.asarray(outlet.direction, float)
+        self._slots_m = self._tip_m + radius_m * self._direction + self._slots(float(outlet.tip_radius_m or 0.0))
+        self._samples_m = cavity.sample(LEVEL_SAMPLES)
+        self._volume_share = 4 / 3 * math.pi * radius_m**3 / PACKING / cavity.volume_m3
+
+    def _slots(self, tip_radius_m: float) -> Array:
+        """(S, 3) places side by side in the tip's mouth: one, or seven when it is wide enough."""
+        ring_m = 2.1 * self._radius_m
+        if tip_radius_m < ring_m + 0.5 * self._radius_m:
+            return np.zeros((1, 3))
+        helper = np.array([0.0, 1.0, 0.0]) if abs(self._direction[1]) < 0.9 else np.array([1.0, 0.0, 0.0])
+        u = np.cross(self._direction, helper)
+        u /= np.linalg.norm(u)
+        v = np.cross(self._direction, u)
+        angle = np.arange(6)[:, None] * (math.pi / 3)
+        return np.vstack([np.zeros((1, 3)), ring_m * (np.cos(angle) * u + np.sin(angle) * v)])
+
+    def level_m(self, T_world_vessel: Array, held: int) -> float:
+        """Height in the world of the surface of a liquid of `held` particles' volume; -inf when there is none."""
+        if held == 0:
+            return -math.inf
+        heights = self._samples_m @ T_world_vessel[2, :3]
+        rank = min(len(heights) - 1, int(held * self._volume_share * len(heights)))
+        return float(np.partition(heights, rank)[rank] + T_world_vessel[2, 3])
+
+    def may_flow(self, T_world_vessel: Array, points_m: Array) -> bool:
+        """A cheap necessary condition: the tip lies below some particle."""
+        tip_z = float(T_world_vessel[2, :3] @ self._tip_m + T_world_vessel[2, 3])
+        return tip_z < float(points_m[:, 2].max()) + 2.0 * self._radius_m
+
+    def move(self, points_m: Array, velocity_m_s: Array, T_world_vessel: Array, twist: Array) -> bool:
+        """Move at most one particle, in place, in `points_m` and `velocity_m_s` (N, 3); True if one was moved.
+
+        twist: (6,) linear [m/s] and angular [rad/s] velocity of the vessel's origin, world axes.
+        """
+        R, p = T_world_vessel[:3, :3], T_world_vessel[:3, 3]
+        slots = self._slots_m @ R.T + p
+        gap = np.linalg.norm(points_m[:, None] - slots, axis=2).min(axis=0)
+        clear = np.flatnonzero(gap > 2.0 * self._radius_m)
+        if len(clear) == 0:
+            return False
+        local = (points_m - p) @ R
+        held = np.flatnonzero(self._cavity.contains(local))
+        level_m = self.level_m(T_world_vessel, len(held))
+        tip_z, entry_z = (float(R[2] @ point + p[2]) for point in (self._tip_m, self._entry_m))
+        if level_m <= max(tip_z, entry_z):
+            return False
+        chosen = held[int(np.argmin(np.linalg.norm(local[held] - self._entry_m, axis=1)))]
+        place = slots[clear[0]]
+        # Torricelli's speed, held within what drips and what the channel's friction leaves.
+        speed = min(max(math.sqrt(2 * GRAVITY_M_S2 * (level_m - tip_z)), 0.35), 0.8)
+        points_m[chosen] = place
+        velocity_m_s[chosen] = twist[:3] + np.cross(twist[3:], place - p) + speed * (R @ self._direction)
+        return True
+
+
+def add_particles(
+    spec: mujoco.MjSpec, count: int, radius_m: float, liquid: Liquid, contact: dict[str, object], rgba: list[float]
+) -> None:
+    """Add `count` particles to a spec: bodies `particle_I` with slide joints `particle_I_x|y|z`."""
+    axes = (("x", [1, 0, 0]), ("y", [0, 1, 0]), ("z", [0, 0, 1]))
+    for i in range(count):
+        body = spec.worldbody.add_body(name=f"particle_{i}")
+        body.mass, body.inertia = liquid.particle_mass_kg, [1e-8, 1e-8, 1e-8]
+        body.explicitinertial = True
+        for name, axis in axes:
+            joint = body.add_joint(name=f"particle_{i}_{name}", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
+            joint.damping = np.array([liquid.drag_kg_s, 0.0, 0.0])
+        geom = body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[radius_m, 0, 0], rgba=rgba, **contact)
+        geom.group = 1

@@ -1,0 +1,112 @@
+"""The environment's arguments: checked at construction, each with an error that names the mend."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ..extract.errors import UserError
+from ..extract.geometry import Array
+from .observations import resampled
+from .reference import Reference
+from .scene import CAMERAS, MAX_PICTURE_PX
+
+MAX_PARTICLES = 500
+# Longer steps let particles leak through walls.
+MAX_TIMESTEP_S = 0.002
+
+
+def one_of(name: str, value: object, valid: Sequence[str]) -> None:
+    """Raise UserError unless the value is one of the valid names."""
+    if value not in valid:
+        raise UserError(f"{name} is {value!r}; choose {', '.join(valid)}")
+
+
+def preset[T](name: str, value: str | T, presets: Mapping[str, T], kind: type[T]) -> T:
+    """A preset by its name, or the value itself when it is of the kind already."""
+    if isinstance(value, kind):
+        return value
+    one_of(name, value, tuple(presets))
+    return presets[str(value)]
+
+
+def offset(name: str, value: object) -> Array:
+    """A reset option (3,) in m."""
+    vector = np.asarray(value, np.float64)
+    if vector.shape != (3,) or not np.all(np.isfinite(vector)):
+        raise UserError(f"reset option {name} is {value!r}; give three numbers in m")
+    return vector
+
+
+def timing(control_hz: float, timestep_s: float | None) -> tuple[float, int]:
+    """Physics step in s and how many make a control period."""
+    if not 1.0 <= control_hz <= 500.0:
+        raise UserError(f"control_hz is {control_hz}; choose 1 to 500")
+    period_s = 1.0 / control_hz
+    if timestep_s is None:
+        steps = math.ceil(period_s / MAX_TIMESTEP_S - 1e-9)
+        return period_s / steps, steps
+    if not 1e-4 <= timestep_s <= MAX_TIMESTEP_S:
+        raise UserError(
+            f"timestep_s is {timestep_s}; choose 0.0001 to {MAX_TIMESTEP_S}: longer steps let particles leak"
+        )
+    steps = round(period_s / timestep_s)
+    if abs(steps * timestep_s - period_s) > 1e-9:
+        raise UserError(
+            f"timestep_s {timestep_s} does not divide the control period of {period_s:.6g} s; "
+            f"choose {period_s / math.ceil(period_s / timestep_s):.6g} or None"
+        )
+    return timestep_s, steps
+
+
+def load_reference(reference: Reference | Path | str | None, control_hz: float) -> Reference:
+    """A reference from a file, as given, or the built-in one, at the control rate."""
+    if reference is None:
+        from .builtin import builtin_reference
+
+        return builtin_reference(control_hz)
+    if isinstance(reference, str | Path):
+        reference = Reference.load(Path(reference))
+    if not isinstance(reference, Reference):
+        raise UserError(f"reference is a {type(reference).__name__}; give a Reference, a path or None")
+    return resampled(reference, control_hz)
+
+
+def check_number(name: str, value: float, low: float, high: float) -> None:
+    """Raise UserError unless low <= value <= high."""
+    if not low <= value <= high:
+        raise UserError(f"{name} is {value}; give a number from {low:g} to {high:g}")
+
+
+def limit(name: str, value: float | None) -> float | None:
+    """A positive threshold, or None."""
+    if value is not None and not value > 0.0:
+        raise UserError(f"{name} is {value}; give a positive number, or None to never terminate")
+    return value
+
+
+def particle_count(value: int) -> int:
+    """A number of particles that the engine can bear."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or not 0 <= value <= MAX_PARTICLES:
+        raise UserError(f"num_particles is {value!r}; give a whole number from 0 to {MAX_PARTICLES}")
+    return int(value)
+
+
+def picture_size(name: str, size: Sequence[int]) -> tuple[int, int]:
+    """(height, width) in px."""
+    if len(size) != 2 or not all(16 <= int(side) <= MAX_PICTURE_PX for side in size):
+        raise UserError(f"{name} is {size!r}; give (height, width) from 16 to {MAX_PICTURE_PX} px")
+    return int(size[0]), int(size[1])
+
+
+def check_cameras(cameras: Sequence[str], render_camera: str, render_mode: str | None) -> None:
+    """Known and different camera names, and a render mode that exists."""
+    if isinstance(cameras, str) or len(set(cameras)) != len(cameras) or len(cameras) == 0:
+        raise UserError(f"cameras is {cameras!r}; give a tuple of different names out of {', '.join(CAMERAS)}")
+    for camera in (*cameras, render_camera):
+        one_of("camera", camera, CAMERAS)
+    if render_mode is not None:
+        one_of("render_mode", render_mode, ("rgb_array",))

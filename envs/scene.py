@@ -1,0 +1,288 @@
+"""The whole scene as one `MjSpec`: robot, table, held vessel, receptacle, particles, cameras, lights.
+
+Contact pairs: particles touch particles, vessels and furniture; the arm touches furniture. Nothing else collides: the
+vessels do not touch each other or the table, the arm touches neither particles nor itself.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import mujoco
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..extract.errors import UserError
+from ..extract.geometry import Array, invert_pose, look_at, make_pose, transform_points
+from .liquid import Liquid, add_particles
+from .panda import CONTACT_PARTICLE, CONTACT_ROBOT, CONTACT_VESSEL, panda_spec
+from .vessel_geometry import Box, Cavity, cavity_of, collision_boxes, visual_parts
+
+if TYPE_CHECKING:
+    from ..extract.vessels import Vessel
+    from .reference import Reference
+
+CAMERAS = ("front", "wrist", "side")
+VESSEL_BODY, RECEPTACLE_BODY = "vessel", "receptacle"
+TABLE_CENTER_XY_M, TABLE_HALF_M, TABLE_THICKNESS_M = (0.35, 0.0), (0.75, 0.75), 0.04
+FLOOR_Z_M = -0.72
+MAX_PICTURE_PX = 1920
+WATER_RGBA = [0.42, 0.78, 0.98, 1.0]
+# The receptacle gets a pedestal when it stands higher than this above the table.
+PEDESTAL_FROM_M = 0.004
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A compiled scene and what is needed to work with it.
+
+    vessel_cavity, receptacle_cavity: the hollows, each in its vessel's frame. vessel_boxes: collision shapes of the
+    held vessel. T_world_receptacle: (4, 4) where the model has the receptacle. radius_m: particle radius.
+    """
+
+    model: mujoco.MjModel
+    vessel: Vessel
+    receptacle: Vessel
+    vessel_cavity: Cavity
+    receptacle_cavity: Cavity
+    vessel_boxes: list[Box]
+    T_world_receptacle: Array
+    num_particles: int
+    radius_m: float
+
+
+def build_scene(reference: Reference, num_particles: int, liquid: Liquid, timestep_s: float) -> Scene:
+    """Build and compile the scene of a reference.
+
+    Raises UserError when the receptacle would stand in the table.
+    """
+    vessel, receptacle = reference.vessel(), reference.receptacle()
+    vessel_cavity, receptacle_cavity = cavity_of(vessel), cavity_of(receptacle)
+    radius_m = liquid.radius_for(num_particles, vessel_cavity.volume_m3, receptacle_cavity.volume_m3)
+    T_world_receptacle = reference.T_world_receptacle
+
+    spec = panda_spec()
+    spec.modelname = "vid2demo_pouring"
+    _set_options(spec, timestep_s)
+    contact = {"condim": 1, "solref": [2 * timestep_s, 1.0]}
+    _add_furniture(spec, contact)
+    vessel_contact = {**contact, "contype": CONTACT_VESSEL, "conaffinity": CONTACT_PARTICLE}
+    vessel_boxes = collision_boxes(vessel, vessel_cavity)
+    # The vessel is a part of the hand's own tree, not a free body tied by a weld constraint: it cannot slip or lag, and
+    # it costs the contact solver nothing. What a hand of rubber and steel would give way is left out.
+    held = spec.body("panda_hand_tcp").add_body(name=VESSEL_BODY, **_placed(reference.T_hand_object))
+    _add_vessel(spec, held, vessel, vessel_boxes, vessel_contact)
+    held.gravcomp = 1.0
+    standing = spec.worldbody.add_body(name=RECEPTACLE_BODY, **_placed(T_world_receptacle))
+    _add_vessel(spec, standing, receptacle, collision_boxes(receptacle, receptacle_cavity), vessel_contact)
+    _add_pedestal(spec, standing, receptacle, T_world_receptacle, vessel_contact)
+    particle_contact = {**contact, "contype": CONTACT_PARTICLE, "conaffinity": CONTACT_PARTICLE | CONTACT_VESSEL}
+    add_particles(spec, num_particles, radius_m, liquid, particle_contact, WATER_RGBA)
+    _add_cameras(spec, reference, vessel, T_world_receptacle)
+    model = spec.compile()
+    return Scene(
+        model,
+        vessel,
+        receptacle,
+        vessel_cavity,
+        receptacle_cavity,
+        vessel_boxes,
+        T_world_receptacle,
+        num_particles,
+        radius_m,
+    )
+
+
+def wxyz(R: Array) -> list[float]:
+    """Quaternion of a rotation matrix in MuJoCo's order."""
+    return [float(v) for v in Rotation.from_matrix(R).as_quat(scalar_first=True)]
+
+
+def _placed(T: Array) -> dict[str, Any]:
+    return {"pos": T[:3, 3].tolist(), "quat": wxyz(T[:3, :3])}
+
+
+def _set_options(spec: mujoco.MjSpec, timestep_s: float) -> None:
+    option = spec.option
+    option.timestep = timestep_s
+    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    # Eight iterations of CG are what 100 contacts need to stay tight; leaks and jitter were measured at these values.
+    option.solver, option.iterations = mujoco.mjtSolver.mjSOL_CG, 8
+    # A diverged state must be seen, not silently replaced by the initial one.
+    option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+    visual = spec.visual
+    # Software rendering: no shadow maps, no multisampling, coarse spheres.
+    visual.quality.shadowsize, visual.quality.offsamples = 0, 0
+    visual.quality.numslices, visual.quality.numstacks, visual.quality.numquads = 10, 7, 1
+    visual.map.znear, visual.map.zfar = 0.01, 40.0
+    visual.headlight.active = True
+    visual.headlight.ambient, visual.headlight.diffuse = [0.42, 0.42, 0.44], [0.25, 0.25, 0.25]
+    visual.headlight.specular = [0.0, 0.0, 0.0]
+    visual.global_.offwidth, visual.global_.offheight = MAX_PICTURE_PX, MAX_PICTURE_PX
+    spec.stat.center, spec.stat.extent = [0.4, 0.0, 0.3], 1.2
+    down = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
+    for direction, diffuse, specular in (([-0.4, 0.5, -1.0], 0.45, 0.35), ([-0.6, -0.7, -0.5], 0.2, 0.0)):
+        light = spec.worldbody.add_light(type=down, dir=direction, diffuse=[diffuse] * 3, specular=[specular] * 3)
+        light.castshadow = False
+        light.ambient = [0.0, 0.0, 0.0]
+    sky = spec.add_texture(name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, width=64, height=384)
+    sky.builtin = mujoco.mjtBuiltin.mjBUILTIN_GRADIENT
+    sky.rgb1, sky.rgb2 = [0.62, 0.74, 0.88], [0.93, 0.95, 0.97]
+
+
+def _wood(size: int = 256) -> bytes:
+    """RGB bytes of planks with a fine grain, the same at every call."""
+    v, u = np.mgrid[0:size, 0:size] / size
+    plank = np.floor(v * 6)
+    shade = 0.05 * np.sin(12.9898 * plank + 4.1) + 0.02 * np.sin(2 * np.pi * 3 * u + 5 * plank)
+    grain = 0.035 * np.sin(2 * np.pi * (v * 46 + 0.9 * np.sin(2 * np.pi * (u + 0.37 * plank)) + 0.15 * plank))
+    groove = np.where((v * 6) % 1.0 < 0.03, -0.18, 0.0)
+    tone = 0.86 + shade + grain + groove
+    rgb = tone[..., None] * np.array([0.86, 0.70, 0.52])
+    return bytes((np.clip(rgb, 0, 1) * 255).astype(np.uint8).tobytes())
+
+
+def _textured(spec: mujoco.MjSpec, name: str, repeat: float, **texture: Any) -> None:
+    data = texture.pop("data", None)
+    added = spec.add_texture(name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, **texture)
+    if data is not None:
+        added.data = data
+    material = spec.add_material(name=name, texrepeat=[repeat, repeat], specular=0.1, shininess=0.2)
+    textures = list(material.textures)
+    textures[int(mujoco.mjtTextureRole.mjTEXROLE_RGB)] = name
+    material.textures = textures
+
+
+def _add_furniture(spec: mujoco.MjSpec, contact: dict[str, Any]) -> None:
+    _textured(spec, "wood", 1.0, width=256, height=256, nchannel=3, data=_wood())
+    _textured(
+        spec,
+        "tiles",
+        8.0,
+        width=128,
+        height=128,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
+        rgb1=[0.78, 0.80, 0.82],
+        rgb2=[0.72, 0.74, 0.77],
+    )
+    solid = {**contact, "contype": 0, "conaffinity": CONTACT_PARTICLE | CONTACT_ROBOT}
+    half = [*TABLE_HALF_M, TABLE_THICKNESS_M / 2]
+    x, y = TABLE_CENTER_XY_M
+    spec.worldbody.add_geom(
+        name="table",
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        size=half,
+        pos=[x, y, -half[2]],
+        material="wood",
+        **solid,
+    )
+    floor_size = [4.0, 4.0, 0.1]
+    spec.worldbody.add_geom(
+        name="floor",
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        size=floor_size,
+        pos=[x, y, FLOOR_Z_M],
+        material="tiles",
+        **solid,
+    )
+    leg_m = (-FLOOR_Z_M - TABLE_THICKNESS_M) / 2
+    for sx in (-1, 1):
+        for sy in (-1, 1):
+            spec.worldbody.add_geom(
+                type=mujoco.mjtGeom.mjGEOM_BOX,
+                size=[0.025, 0.025, leg_m],
+                pos=[x + sx * (half[0] - 0.06), y + sy * (half[1] - 0.06), FLOOR_Z_M + leg_m],
+                rgba=[0.30, 0.31, 0.33, 1.0],
+                contype=0,
+                conaffinity=0,
+            )
+
+
+def _add_vessel(
+    spec: mujoco.MjSpec, body: mujoco.MjsBody, vessel: Vessel, boxes: list[Box], contact: dict[str, Any]
+) -> None:
+    """Drawn parts, invisible collision shapes and inertia of a vessel."""
+    name = body.name
+    for number, (rgba, vertices, faces) in enumerate(visual_parts(vessel.mesh)):
+        mesh = spec.add_mesh(name=f"{name}_{number}", uservert=vertices.ravel(), userface=faces.ravel())
+        mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+        spec.add_material(name=f"{name}_{number}", rgba=list(rgba), specular=0.6, shininess=0.6)
+        geom = body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name, material=f"{name}_{number}")
+        geom.group, geom.contype, geom.conaffinity, geom.mass = 1, 0, 0, 0.0
+    for box in boxes:
+        kind = mujoco.mjtGeom.mjGEOM_CYLINDER if box.round else mujoco.mjtGeom.mjGEOM_BOX
+        size = [box.half_m[0], box.half_m[2], 0.0] if box.round else box.half_m.tolist()
+        geom = body.add_geom(type=kind, size=size, pos=box.center_m.tolist(), quat=wxyz(box.R), **contact)
+        geom.group, geom.mass = 3, 0.0
+    body.mass, body.explicitinertial = vessel.mass_kg, True
+    # A box of the vessel's size, its mass spread toward the walls, is near enough for what a wrist feels.
+    x, y, z = vessel.extents_m
+    body.inertia = [vessel.mass_kg / 8 * (a * a + b * b) for a, b in ((y, z), (x, z), (x, y))]
+
+
+def _add_pedestal(
+    spec: mujoco.MjSpec, body: mujoco.MjsBody, receptacle: Vessel, T_world: Array, contact: dict[str, Any]
+) -> None:
+    corners = transform_points(T_world, np.asarray(receptacle.mesh.vertices))
+    bottom_m = float(corners[:, 2].min())
+    if bottom_m < -0.01:
+        raise UserError(
+            f"the receptacle's lowest point lies {-1000 * bottom_m:.0f} mm below the table; "
+            "move T_world_receptacle up or build the reference again"
+        )
+    if bottom_m < PEDESTAL_FROM_M:
+        return
+    # Only the foot must be carried: the part of the vessel within 5 mm of its lowest point.
+    foot = corners[corners[:, 2] < bottom_m + 0.005]
+    center = (foot[:, :2].min(0) + foot[:, :2].max(0)) / 2
+    radius = max(0.03, float(np.linalg.norm(foot[:, :2] - center, axis=1).max()) + 0.012)
+    T = invert_pose(T_world) @ make_pose(None, (float(center[0]), float(center[1]), bottom_m / 2))
+    geom = body.add_geom(
+        name="pedestal",
+        type=mujoco.mjtGeom.mjGEOM_CYLINDER,
+        size=[radius, bottom_m / 2, 0],
+        rgba=[0.55, 0.58, 0.62, 1.0],
+        **_placed(T),
+        **contact,
+    )
+    geom.group, geom.mass = 1, 0.0
+
+
+def _add_cameras(spec: mujoco.MjSpec, reference: Reference, vessel: Vessel, T_world_receptacle: Array) -> None:
+    """Cameras from which the whole motion and the receptacle can be seen."""
+    path = reference.T_world_object[:, :3, 3]
+    points = np.vstack([path, T_world_receptacle[:3, 3]])
+    low, high = points.min(0), points.max(0)
+    target = (low + high) / 2
+    size_m = float(np.linalg.norm(high - low)) / 2 + 0.75 * float(np.linalg.norm(vessel.extents_m))
+    fovy_deg = 45.0
+    distance_m = max(0.5, 0.85 * size_m / math.sin(math.radians(fovy_deg / 2)))
+    # The stream lies in the vertical plane through lip and receptacle: the side camera looks across it.
+    outlet = reference.T_world_object[reference.pour_index, :3, :3] @ vessel.outlet.direction
+    heading = math.atan2(float(outlet[1]), float(outlet[0]))
+    across = heading + math.pi / 2
+    if math.cos(across) < 0 or (abs(math.cos(across)) < 0.2 and math.sin(across) > 0):
+        across += math.pi  # never from behind the robot
+    for name, azimuth, elevation_deg, reach in (("front", 0.35, 22.0, 1.0), ("side", across, 10.0, 0.85)):
+        rise = math.radians(elevation_deg)
+        away = np.array([math.cos(azimuth) * math.cos(rise), math.sin(azimuth) * math.cos(rise), math.sin(rise)])
+        _add_camera(
+            spec.worldbody, name, look_at(target + reach * distance_m * away, target, np.array([0, 0, 1.0])), fovy_deg
+        )
+
+    # On the wrist: above the hand on the side to which the vessel opens, looking between mouth and outlet.
+    T = reference.T_hand_object
+    upward = T[:3, 2] * np.array([1.0, 1.0, 0.0])
+    upward = upward / np.linalg.norm(upward) if np.linalg.norm(upward) > 0.3 else np.array([1.0, 0.0, 0.0])
+    mouth, lip = transform_points(T, np.array([[0.0, 0.0, vessel.extents_m[2] / 2], vessel.outlet.point_m]))
+    middle, spread_m = (mouth + lip) / 2, float(np.linalg.norm(mouth - lip))
+    eye = np.array([0.0, 0.0, -0.09]) + upward * (max(float(mouth @ upward), float(lip @ upward), 0.0) + 0.11)
+    _add_camera(spec.body("panda_hand_tcp"), "wrist", look_at(eye, middle, upward), 60.0 + 60.0 * min(spread_m, 0.2))
+
+
+def _add_camera(body: mujoco.MjsBody, name: str, T: Array, fovy_deg: float) -> None:
+    # MuJoCo's cameras look along -z with y up; OpenCV's along +z with y down.
+    R = T[:3, :3] @ np.diag([1.0, -1.0, -1.0])
+    body.add_camera(name=name, pos=T[:3, 3].tolist(), quat=wxyz(R), fovy=fovy_deg)
