@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from ..envs.panda import ARM_JOINTS
 from ..extract.errors import UserError
 from ..extract.files import write_json
 from .dataset import DatasetLayout
@@ -69,7 +70,7 @@ class AttemptRunner:
         return DatasetLayout(
             fps=fps,
             task=task,
-            action_names=tuple(f"panda_joint{i + 1}" for i in range(env.action_space.shape[0])),
+            action_names=tuple(f"{name}_rad" for name in ARM_JOINTS),
             state_names=tuple(names["agent_pos"]),
             environment_names=tuple(names["environment_state"]),
             cameras=self.settings.cameras,

@@ -22,7 +22,7 @@ from ..extract.errors import UserError
 from ..extract.files import sha256_of_file, write_json
 from ..extract.stages import Progress, code_hash, plain, versions
 from .attempt import AttemptRunner, AttemptSettings, episode_file
-from .dataset import import_lerobot, write_dataset
+from .dataset import require_lerobot, write_dataset
 from .rollout import DEFAULT_ENV_ID
 from .stored import COLLECTION_FILE, check_dataset, read_collection
 from .workers import attempts_in_order
@@ -62,7 +62,7 @@ def collect(
     _check_input(episodes, workers, image_size, cameras)
     limit = max_attempts or max(MIN_ATTEMPTS, ATTEMPTS_PER_EPISODE * episodes)
     reference = Reference.load(reference_path)
-    import_lerobot()
+    require_lerobot()
     settings = AttemptSettings(
         reference=str(reference_path.resolve()),
         seed=seed,

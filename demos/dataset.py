@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import shutil
 import tempfile
@@ -114,13 +115,16 @@ def import_lerobot() -> Any:
     HF_HUB_OFFLINE is set to 1 unless the user has set it. Raises UserError when lerobot is not installed.
     """
     os.environ.setdefault("HF_HUB_OFFLINE", "1")
-    try:
-        from lerobot.datasets import lerobot_dataset
-    except ModuleNotFoundError as error:
-        raise UserError(
-            f"writing datasets needs {error.name}, which is not installed; run `pip install 'vid2demo[lerobot]'`"
-        ) from error
+    require_lerobot()
+    from lerobot.datasets import lerobot_dataset
+
     return lerobot_dataset
+
+
+def require_lerobot() -> None:
+    """Raise UserError unless lerobot is installed, without the time its import takes."""
+    if importlib.util.find_spec("lerobot") is None:
+        raise UserError("writing datasets needs lerobot, which is not installed; run `pip install 'vid2demo[lerobot]'`")
 
 
 def write_dataset(

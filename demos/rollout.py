@@ -78,7 +78,7 @@ def joint_actions(joints: JointTrajectory, env: Any) -> NDArray[np.float32]:
     return actions
 
 
-def make_env(env_id: str, reference: Path | str, **kwargs: Any) -> Any:
+def make_env(env_id: str, reference: Path | str | None, **kwargs: Any) -> Any:
     """`gym.make` without the passive checker, whose warnings are for people who write environments."""
     import gymnasium
 
@@ -111,7 +111,8 @@ def roll_out(
         action = np.asarray(controller.act(observation), np.float32)
         actions.append(action)
         agent_pos.append(np.array(observation["agent_pos"], np.float32))
-        environment.append(np.array(observation["environment_state"], np.float32))
+        # A policy that sees pixels only is rolled out without it.
+        environment.append(np.array(observation.get("environment_state", ()), np.float32))
         for camera, encoder in encoders.items():
             encoder.write(observation["pixels"][camera])
         before = observation

@@ -117,3 +117,27 @@ def stand_in_reference(tmp_path: Path) -> Path:
     path = tmp_path / "kettle.reference.npz"
     Reference.from_poses(np.tile(np.eye(4), (STEPS, 1, 1)), np.arange(STEPS) / 25, header).save(path)
     return path
+
+
+# Small pictures and few particles: everything is as in a real collection, and quick.
+SMALL = {"image_size": (64, 64), "env_kwargs": {"num_particles": 20}}
+
+
+@pytest.fixture(scope="session")
+def pour_reference(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The built-in pour of a mug into a bowl, as a file."""
+    from vid2demo.envs.builtin import builtin_reference
+
+    path = tmp_path_factory.mktemp("reference") / "mug.reference.npz"
+    builtin_reference().save(path)
+    return path
+
+
+@pytest.fixture(scope="session")
+def pour_dataset(pour_reference: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two episodes of the real environment. Read only."""
+    from vid2demo.demos.collect import collect
+
+    out = tmp_path_factory.mktemp("collected") / "dataset"
+    collect(pour_reference, out, episodes=2, seed=1, **SMALL)
+    return out
