@@ -182,6 +182,8 @@ def _vertex_colors(part: Any) -> np.ndarray[Any, np.dtype[np.uint8]]:
         colors = np.asarray((visual.to_color() if visual.kind == "texture" else visual).vertex_colors, np.uint8)
     except Exception:  # textures may be missing or damaged; the shape is still good
         return grey
+    if colors.shape == (4,):
+        return np.tile(colors, (len(grey), 1))
     return colors if colors.shape == grey.shape else grey
 
 

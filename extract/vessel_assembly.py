@@ -153,6 +153,26 @@ def lip_outlet(walls: Walls) -> Outlet:
     return Outlet("lip", point, np.array([1.0, 0.0, 0.0]))
 
 
+def beak(walls: Walls, rgba: Color, radius_m: float) -> tuple[Part, Outlet]:
+    """Hole of `radius_m` through the closed top above a pulled-out lip: the channel to cut, and the outlet."""
+    assert walls.lip is not None
+    reach, top = walls.lip.reach_m, walls.height_m
+    ceiling, inner = float(walls.inner[-1, 0]), float(walls.inner[-1, 1])
+    start = np.array([inner + 0.25 * reach - 0.5 * radius_m, ceiling - 0.5 * radius_m])
+    end = np.array([walls.outer_radius(top) + 0.85 * reach - 1.3 * radius_m, top])
+    direction = (end - start) / np.linalg.norm(end - start)
+    channel = tube(np.vstack([start, end + direction * (OVERCUT_M + radius_m)]), radius_m)
+    outlet = Outlet(
+        "spout",
+        np.array([end[0], 0.0, end[1]]),
+        np.array([direction[0], 0.0, direction[1]]),
+        np.array([start[0], 0.0, ceiling]),
+        radius_m,
+        radius_m,
+    )
+    return Part(channel, rgba), outlet
+
+
 def spout(
     walls: Walls,
     path: Array,

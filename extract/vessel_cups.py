@@ -21,8 +21,8 @@ from .vessel_types import Color, Range
 Params = Mapping[str, float]
 
 MUG = {
-    "height_m": Range(0.07, 0.13, 0.100),
-    "top_radius_m": Range(0.030, 0.055, 0.0415),
+    "height_m": Range(0.07, 0.13, 0.090),
+    "top_radius_m": Range(0.030, 0.055, 0.0445),
     "base_ratio": Range(0.75, 1.08, 0.88, "1"),
     "wall_m": Range(0.0025, 0.006, 0.004),
     "base_round_m": Range(0.001, 0.012, 0.006),
@@ -68,8 +68,8 @@ def mug(p: Params, rgba: Color) -> Draft:
 CUP = {
     "height_m": Range(0.05, 0.08, 0.062),
     "top_radius_m": Range(0.036, 0.055, 0.046),
-    "base_ratio": Range(0.42, 0.7, 0.54, "1"),
-    "belly": Range(0.0, 1.0, 0.55, "1"),
+    "base_ratio": Range(0.38, 0.62, 0.46, "1"),
+    "belly": Range(0.0, 1.0, 0.6, "1"),
     "wall_m": Range(0.002, 0.0045, 0.003),
     "handle_reach_m": Range(0.018, 0.032, 0.024),
     "handle_thickness_m": Range(0.0045, 0.008, 0.006),
@@ -86,8 +86,9 @@ def cup(p: Params, rgba: Color) -> Draft:
         [
             (0.0, base),
             (foot, base),
-            (foot + 0.25 * (h - foot), base + (top - base) * (0.34 + 0.20 * full)),
-            (foot + 0.60 * (h - foot), base + (top - base) * (0.68 + 0.16 * full)),
+            (foot + 0.03 * (h - foot), base + (top - base) * 0.05),
+            (foot + 0.25 * (h - foot), base + (top - base) * (0.42 + 0.24 * full)),
+            (foot + 0.60 * (h - foot), base + (top - base) * (0.74 + 0.17 * full)),
             (h, top),
         ]
     )

@@ -14,6 +14,7 @@ from .vessel_assembly import (
     STEEL_KG_M3,
     Draft,
     Part,
+    beak,
     body_grasp,
     handle_grasp,
     knob,
@@ -21,7 +22,7 @@ from .vessel_assembly import (
     round_walls,
     spout,
 )
-from .vessel_shapes import cumulative_share, lofted, rounded_path, smooth_profile, tube
+from .vessel_shapes import Lip, cumulative_share, lofted, rounded_path, smooth_profile, tube
 from .vessel_types import Color, GraspRegion, Range
 
 Params = Mapping[str, float]
@@ -233,8 +234,8 @@ ELECTRIC_KETTLE = {
     "base_radius_m": Range(0.06, 0.095, 0.078),
     "top_ratio": Range(0.6, 0.95, 0.76, "1"),
     "wall_m": Range(0.0008, 0.002, 0.0012),
-    "beak_out_m": Range(0.016, 0.036, 0.024),
-    "beak_radius_m": Range(0.011, 0.018, 0.014),
+    "beak_out_m": Range(0.018, 0.034, 0.026),
+    "beak_depth": Range(0.2, 0.45, 0.32, "1"),
     "handle_reach_m": Range(0.045, 0.075, 0.058),
     "handle_bottom": Range(0.08, 0.4, 0.18, "1"),
     "handle_thickness_m": Range(0.016, 0.028, 0.022),
@@ -247,17 +248,17 @@ def electric_kettle(p: Params, rgba: Color) -> Draft:
     h, base, top = p["height_m"], p["base_radius_m"], p["top_ratio"] * p["base_radius_m"]
     foot = p["foot_m"]
     outer = smooth_profile([(0.9 * foot, base), (0.5 * h, 0.45 * base + 0.55 * top), (h, top)], 50)
-    walls = round_walls(outer, p["wall_m"], foot + p["wall_m"], inner_fillet_m=0.004, ceiling_m=h - 0.002)
+    walls = round_walls(
+        outer,
+        p["wall_m"],
+        foot + p["wall_m"],
+        inner_fillet_m=0.004,
+        ceiling_m=h - 0.002,
+        lip=Lip(p["beak_out_m"], p["beak_depth"] * h, 0.40),
+    )
     lid = [(h - 0.002, 0.93 * top), (h + 0.008, 0.90 * top), (h + 0.012, 0.7 * top)]
     stand, hollow = (lofted(np.array([[z, k * base], [foot, k * base]])) for z, k in ((0.0, 1.01), (-0.001, 0.94)))
-    root = p["beak_radius_m"]
-    tip = max(0.5 * root, p["wall_m"] + 0.003)
-    z0 = h - root - 0.006
-    wall_x, out = walls.outer_radius(z0), p["beak_out_m"]
-    path = np.array([[0.0, z0], [wall_x - 0.8 * root, z0], [wall_x + 0.1 * root, z0 + 0.1 * root]])
-    path = np.vstack([path, [wall_x + out, h + 0.002]])
-    path = rounded_path(path, [0.8 * root, 0.8 * root], steps=6)
-    beak, channel, outlet = spout(walls, path, root, tip, p["wall_m"], rgba, root_aspect=1.5)
+    channel, outlet = beak(walls, BLACK, 0.22 * p["beak_out_m"])
     thick = 0.5 * p["handle_thickness_m"]
     z_top, z_low = h - thick - 0.006, max(p["handle_bottom"] * h, foot + thick)
     x_out = -(base + p["handle_reach_m"] - thick)
@@ -273,6 +274,6 @@ def electric_kettle(p: Params, rgba: Color) -> Draft:
         STEEL_KG_M3,
         outlet,
         [grip, body_grasp(walls, 0.4, 0.9, sideways=True)],
-        additions=[beak, *dark],
+        additions=dark,
         cuts=[channel],
     )

@@ -14,6 +14,7 @@ from .vessel_assembly import (
     STEEL_KG_M3,
     Draft,
     Part,
+    beak,
     body_grasp,
     handle_grasp,
     knob,
@@ -39,8 +40,8 @@ TEAPOT = {
     "spout_radius_m": Range(0.012, 0.02, 0.016),
     "spout_taper": Range(0.4, 0.7, 0.5, "1"),
     "spout_curl": Range(0.0, 1.0, 0.5, "1"),
-    "handle_reach_m": Range(0.04, 0.07, 0.052),
-    "handle_thickness_m": Range(0.008, 0.014, 0.010),
+    "handle_reach_m": Range(0.04, 0.07, 0.054),
+    "handle_thickness_m": Range(0.008, 0.014, 0.011),
     "lid_dome_m": Range(0.006, 0.025, 0.014),
     "knob_radius_m": Range(0.007, 0.015, 0.010),
 }
@@ -83,11 +84,11 @@ def teapot(p: Params, rgba: Color) -> Draft:
     path = rounded_path(polyline, [0.5 * root, 2.2 * root, 2.5 * root, 2.0 * tip], steps=8)
     tube_part, channel, outlet = spout(walls, path, root, tip, 0.8 * p["wall_m"], rgba)
     thick = 0.5 * p["handle_thickness_m"]
-    z_top, z_low = 0.80 * h, 0.26 * h
+    z_top, z_low = 0.78 * h, 0.24 * h
     x_out = -(r + p["handle_reach_m"] - thick)
     handle, grip = loop_handle(
         walls,
-        [(0.0, z_top), (0.94 * x_out, z_top + 0.06 * h), (x_out, 0.5 * h), (0.80 * x_out, z_low), (0.0, z_low)],
+        [(0.0, z_top), (0.98 * x_out, z_top + 0.10 * h), (x_out, 0.52 * h), (0.82 * x_out, z_low), (0.0, z_low)],
         thick,
         1.25 * thick,
         rgba,
@@ -116,7 +117,7 @@ MOKA_POT = {
     "waist_height": Range(0.38, 0.5, 0.44, "1"),
     "top_ratio": Range(0.95, 1.12, 1.04, "1"),
     "wall_m": Range(0.002, 0.004, 0.0028),
-    "beak_out_m": Range(0.012, 0.025, 0.017),
+    "beak_out_m": Range(0.014, 0.028, 0.020),
     "handle_reach_m": Range(0.04, 0.065, 0.050),
     "handle_drop": Range(0.3, 0.55, 0.42, "1"),
     "handle_radius_m": Range(0.006, 0.010, 0.0075),
@@ -134,16 +135,18 @@ def moka_pot(p: Params, rgba: Color) -> Draft:
     h, r = p["height_m"], p["radius_m"]
     waist_z, waist, top = p["waist_height"] * h, p["waist_ratio"] * r, p["top_ratio"] * r
     outer = np.array([[0.0, r], [waist_z - 0.004, waist], [waist_z + 0.004, waist], [h, top]])
-    walls = round_walls(outer, p["wall_m"], waist_z + 0.006, inner_fillet_m=0.003, ceiling_m=h - 0.003, sides=8)
+    walls = round_walls(
+        outer,
+        p["wall_m"],
+        waist_z + 0.006,
+        inner_fillet_m=0.003,
+        ceiling_m=h - 0.003,
+        lip=Lip(p["beak_out_m"], 0.75 * (h - waist_z), 0.36),
+        sides=8,
+    )
     band = Part(lofted(np.array([[waist_z - 0.006, waist + 0.004], [waist_z + 0.004, waist + 0.004]])), rgba)
     lid = lofted(np.array([[h - 0.001, 0.97 * top], [h + 0.0015, 0.97 * top], [h + 0.09 * h, 0.28 * top]]), sides=8)
-    root = 0.30 * r
-    z0 = h - 0.005 - root
-    wall_x, out = walls.outer_radius(z0), p["beak_out_m"]
-    path = np.array([[0.0, z0], [wall_x - 0.9 * root, z0], [wall_x + out, h + 0.001]])
-    beak, channel, outlet = spout(
-        walls, rounded_path(path, 0.8 * root, steps=6), root, max(0.4 * root, 0.005), 0.0022, rgba, root_aspect=1.25
-    )
+    channel, outlet = beak(walls, rgba, 0.2 * p["beak_out_m"])
     grip_r = p["handle_radius_m"]
     z_top = h - grip_r - 0.004
     x_body = -walls.outer_radius(z_top)
@@ -160,7 +163,6 @@ def moka_pot(p: Params, rgba: Color) -> Draft:
         [handle_grasp(grip, 2 * grip_r), body_grasp(walls, 0.5, 0.95, sideways=True)],
         additions=[
             band,
-            beak,
             Part(lid, rgba),
             Part(handle, BLACK, PLASTIC_KG_M3),
             knob(h + 0.088 * h, p["knob_radius_m"], 1.9 * p["knob_radius_m"], BLACK),

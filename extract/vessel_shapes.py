@@ -43,7 +43,7 @@ class Lip:
 
     def volume_m3(self, z_m: Array, radius_m: Array, rim_m: float) -> float:
         """Volume that the lip adds to a round interior, by integration over the height."""
-        z: Array = np.linspace(rim_m - self.depth_m, rim_m, 400, dtype=np.float64)
+        z: Array = np.linspace(rim_m - self.depth_m, min(rim_m, float(z_m[-1])), 400, dtype=np.float64)
         pull = self.reach_m * self.rise(z, rim_m)
         # The angular shape is cos^2, whose integral is a and that of its square 3a/4 over [-a, a].
         area = self.half_angle_rad * (np.interp(z, z_m, radius_m) * pull + 0.375 * pull**2)
@@ -198,10 +198,12 @@ def lofted(
     """
     z, r = profile[:, 0], profile[:, 1]
     if sides:
-        turn = 2 * np.pi * (np.arange(sides) + 0.5) / sides
-        xy = r[:, None, None] / math.cos(math.pi / sides) * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
-        return stacked_rings(np.concatenate([xy, np.broadcast_to(z[:, None, None], (*xy.shape[:2], 1))], axis=-1))
-    xy = section_outlines(r, np.ones_like(r) if corner is None else corner, aspect, SEGMENTS)
+        turn = 2 * np.pi * (np.arange(SEGMENTS) / SEGMENTS + 0.5 / sides)
+        off_middle = (turn + np.pi / sides) % (2 * np.pi / sides) - np.pi / sides
+        unit = np.stack([np.cos(turn), np.sin(turn)], axis=-1) / np.cos(off_middle)[:, None]
+        xy = r[:, None, None] * unit
+    else:
+        xy = section_outlines(r, np.ones_like(r) if corner is None else corner, aspect, SEGMENTS)
     if lip is not None:
         angle = np.arctan2(xy[..., 1], xy[..., 0])
         shape = np.where(np.abs(angle) < lip.half_angle_rad, np.cos(0.5 * np.pi * angle / lip.half_angle_rad) ** 2, 0.0)
