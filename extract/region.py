@@ -105,6 +105,17 @@ class ColourModel:
             self.seen[k] = 1.0
 
 
+def mask_evidence(mask: NDArray[np.bool_]) -> tuple[NDArray[np.int32], ColourModel]:
+    """A mask in the form of an image of two colours and their model, so that poses can be refined against it.
+
+    The model trusts the mask to four in five, so that a wrong stretch of it does not outvote the rest.
+    """
+    colours = ColourModel()
+    colours.foreground[-1, :2], colours.background[-1, :2] = (0.2, 0.8), (0.8, 0.2)
+    colours.seen[-1] = 1.0
+    return mask.astype(np.int32), colours
+
+
 def colour_bins(rgb: Image) -> NDArray[np.int32]:
     """(H, W) histogram bin of every pixel."""
     shift = 8 - BITS

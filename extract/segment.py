@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
 from .errors import UserError
 from .video import Image
@@ -34,9 +35,11 @@ def mask_from_box(rgb: Image, box_xywh_px: Box, iterations: int = 5) -> Mask:
     height, width = rgb.shape[:2]
     x, y, w, h = (round(v) for v in check_box(box_xywh_px, width, height))
     labels = np.full((height, width), cv2.GC_BGD, np.uint8)
-    labels[y : y + h, x : x + w] = cv2.GC_PR_FGD
+    inner = labels[y : y + h, x : x + w]
+    inner[:] = np.where(_rare_outside(rgb, (x, y, w, h)), cv2.GC_PR_FGD, cv2.GC_PR_BGD)
     mask = _grabcut(rgb, labels, (x, y, w, h), iterations)
-    if mask.sum() < 0.02 * w * h:
+    mask = _largest_part(mask)
+    if mask.sum() < 0.05 * w * h:
         ellipse = np.zeros((height, width), np.uint8)
         cv2.ellipse(ellipse, (x + w // 2, y + h // 2), (w // 2, h // 2), 0, 0, 360, 1, -1)
         mask = ellipse > 0
@@ -66,6 +69,39 @@ def mask_box(mask: Mask) -> Box:
     """Bounding box x, y, width, height of a mask that is not empty."""
     ys, xs = np.nonzero(mask)
     return float(xs.min()), float(ys.min()), float(np.ptp(xs) + 1), float(np.ptp(ys) + 1)
+
+
+def _rare_outside(rgb: Image, box: tuple[int, int, int, int]) -> Mask:
+    """(h, w) pixels of the box whose colours are rare in the ring around it, by smoothed Lab histograms."""
+    height, width = rgb.shape[:2]
+    x, y, w, h = box
+    margin = max(w, h) // 3 + 4
+    x_a, y_a = max(x - margin, 0), max(y - margin, 0)
+    lab = cv2.cvtColor(rgb, cv2.COLOR_RGB2LAB)[y_a : min(y + h + margin, height), x_a : min(x + w + margin, width)]
+    inside = np.zeros(lab.shape[:2], bool)
+    inside[y - y_a : y - y_a + h, x - x_a : x - x_a + w] = True
+    sides, limits = [24, 24, 24], [0.0, 256.0] * 3
+    histograms = []
+    for part in (inside, ~inside):
+        counts = cv2.calcHist([lab], [0, 1, 2], part.astype(np.uint8), sides, limits)
+        histograms.append(gaussian_filter(counts, 0.7) / max(int(part.sum()), 1))
+    if inside.all():
+        return np.ones((h, w), bool)
+    share = histograms[0] / (histograms[0] + histograms[1] + 1e-9)
+    cell = tuple((lab[inside].reshape(h, w, 3) * (24 / 256)).astype(int).transpose(2, 0, 1))
+    return np.asarray(share[cell] > 0.6)
+
+
+def _largest_part(mask: Mask) -> Mask:
+    """The largest connected part of a mask, with every other part at least a fiftieth as large; small holes filled."""
+    count, parts, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
+    if count < 2:
+        return mask
+    areas = stats[1:, cv2.CC_STAT_AREA]
+    kept = np.isin(parts, 1 + np.flatnonzero(areas >= 0.02 * areas.max()))
+    _, holes, hole_stats, _ = cv2.connectedComponentsWithStats((~kept).astype(np.uint8))
+    small = np.flatnonzero(hole_stats[:, cv2.CC_STAT_AREA] < 0.02 * areas.max())
+    return np.asarray(kept | (np.isin(holes, small) & ~kept))
 
 
 def _grabcut(rgb: Image, labels: NDArray[np.uint8], box: tuple[int, int, int, int], iterations: int) -> Mask:

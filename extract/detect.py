@@ -1,0 +1,227 @@
+"""Find a named object in the first frame when no box is given: outlines of its mesh against oriented image edges.
+
+Templates of the mesh over sizes, elevations and yaws slide over maps of edge strength per direction (in the spirit of
+LINE-MOD, Hinterstoisser et al., 2012); the best places are judged again by how the region differs in colour from its
+surroundings, by how much of it moved in the clip, and by how well a mask cut there agrees with the mesh.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from .first_pose import edge_score, edge_strength, silhouette_ious, upright_rotation
+from .geometry import Array, make_pose
+from .raster import render_depth
+from .region import TrackingMesh, extract_outline, mask_evidence, refine
+from .segment import Box, Mask, mask_box, mask_from_box
+from .video import Image
+
+SEARCH_WIDTH_PX = 240
+DIRECTIONS = 8
+OUTLINE_POINTS = 64
+SIZES = tuple(0.16 * 1.22**k for k in range(8))  # longest side of the object over the longest side of the image
+ELEVATIONS_DEG = (5.0, 18.0, 35.0)
+YAW_STEP_DEG = 15.0
+MOVED_LAB = 14.0  # colour change, in Lab units, that counts as motion
+LEAST_MERIT = 1.2
+REFINED = 8
+
+
+@dataclass(frozen=True)
+class _Match:
+    score: float
+    mesh: int
+    T_camera_object: Array
+
+
+def motion_since(first: Image, frames: Iterable[Image], every: int = 5, at_most: int = 40) -> Array:
+    """(H, W) share of later frames, in [0, 1], whose colour at a pixel differs from the first frame's."""
+    reference = _soft_lab(first)
+    changed, count = np.zeros(first.shape[:2]), 0
+    for index, rgb in enumerate(frames):
+        if index == 0 or index % every:
+            continue
+        changed += np.linalg.norm(_soft_lab(rgb) - reference, axis=-1) > MOVED_LAB
+        count += 1
+        if count >= at_most:
+            break
+    return changed / max(count, 1)
+
+
+def find_object(
+    rgb: Image,
+    moved: Array,
+    meshes: Sequence[TrackingMesh],
+    camera_matrix: Array,
+    *,
+    handled: bool,
+    taken: Sequence[Mask] = (),
+) -> Box | None:
+    """Box of the place that looks most like one of the meshes; None when nothing does.
+
+    moved: from `motion_since`.  handled: the object is the one that is handled, so that it must have moved.
+    taken: masks of objects found before, which cannot be found again.
+    """
+    scale = SEARCH_WIDTH_PX / max(rgb.shape[:2])
+    small = cv2.resize(rgb, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    small_camera = np.diag([scale, scale, 1.0]) @ camera_matrix
+    edges = _edge_maps(np.asarray(small, np.uint8))
+    matches: list[_Match] = []
+    for index, mesh in enumerate(meshes):
+        matches += _slide(index, mesh, edges, small_camera, small.shape[:2])
+    matches.sort(key=lambda m: m.score, reverse=True)
+
+    size = (small.shape[1], small.shape[0])
+    small_moved = cv2.resize(moved.astype(np.float32), size)
+    small_taken = [cv2.resize(mask.astype(np.uint8), size) > 0 for mask in taken]
+    lab = _soft_lab(np.asarray(small, np.uint8))
+    judged: list[tuple[float, _Match]] = []
+    for match in matches[:400]:
+        merit = _judge(match, meshes[match.mesh], small_camera, lab, small_moved, small_taken, handled)
+        judged.append((merit, match))
+    judged.sort(key=lambda entry: entry[0], reverse=True)
+
+    strength = edge_strength(rgb)
+    best_merit, best_box = LEAST_MERIT, None
+    for merit, match in _spread(judged, REFINED):
+        mesh, T = meshes[match.mesh], match.T_camera_object
+        window = render_depth(mesh.vertices_m, mesh.faces, T, camera_matrix)
+        if window is None or not (silhouette := window.mask_in_image(rgb.shape[1], rgb.shape[0])).any():
+            continue
+        mask = mask_from_box(rgb, _grown(mask_box(silhouette), 0.06, rgb))
+        T = refine(
+            mesh, T, camera_matrix, *mask_evidence(mask), steps_px=(5, 3, 2, 1),
+            prior_rotation_rad=0.12, prior_translation=0.05, prior_depth=0.1,
+        ).T_camera_object  # fmt: skip
+        window = render_depth(mesh.vertices_m, mesh.faces, T, camera_matrix)
+        if window is None or not (silhouette := window.mask_in_image(rgb.shape[1], rgb.shape[0])).any():
+            continue
+        box = mask_box(silhouette)
+        iou, _ = silhouette_ious(mesh, T, camera_matrix, mask, box)
+        size_share = np.sqrt(np.hypot(box[2], box[3]) / max(rgb.shape[:2]))
+        total = merit + size_share * (iou + edge_score(mesh, T, camera_matrix, strength))
+        if total > best_merit:
+            best_merit, best_box = total, _grown(box, 0.03, rgb)
+    return best_box
+
+
+def _soft_lab(rgb: Image) -> NDArray[np.float32]:
+    lab = cv2.cvtColor(rgb, cv2.COLOR_RGB2LAB)
+    return np.asarray(cv2.GaussianBlur(lab, (0, 0), 1.5), np.float32)
+
+
+def _edge_maps(rgb: Image) -> NDArray[np.float32]:
+    """(DIRECTIONS, H, W) edge strength by direction of the gradient modulo 180 degrees, less the mean over directions.
+
+    Taking off the mean makes clutter, which has edges of every direction, worth nothing.
+    """
+    gradient = edge_strength(rgb)
+    magnitude = np.minimum(np.linalg.norm(gradient, axis=-1), 1.0)
+    angle = np.arctan2(gradient[..., 1], gradient[..., 0]) % np.pi * DIRECTIONS / np.pi
+    maps = []
+    for k in range(DIRECTIONS):
+        gap = np.abs((angle - k + DIRECTIONS / 2) % DIRECTIONS - DIRECTIONS / 2)
+        response = (magnitude * np.clip(1.5 - gap, 0.0, 1.0)).astype(np.float32)
+        maps.append(cv2.dilate(response, np.ones((3, 3), np.uint8)))
+    stack = np.stack(maps)
+    return np.asarray(stack - stack.mean(axis=0), np.float32)
+
+
+def _slide(
+    index: int, mesh: TrackingMesh, edges: NDArray[np.float32], camera_matrix: Array, shape: tuple[int, ...]
+) -> list[_Match]:
+    """Best places of every template of one mesh."""
+    height, width = shape[0], shape[1]
+    centre = np.array([width / 2, height / 2])
+    inverse = np.linalg.inv(camera_matrix)
+    pad = int(0.5 * max(SIZES) * max(shape)) + 4
+    padded = np.pad(edges, [(0, 0), (pad, pad), (pad, pad)])
+    matches = []
+    for elevation in ELEVATIONS_DEG:
+        for yaw in np.arange(0.0, 360.0, YAW_STEP_DEG):
+            R = upright_rotation(elevation, float(yaw))
+            extent = float(np.ptp(mesh.vertices_m @ R.T, axis=0)[:2].max())
+            for size in SIZES:
+                depth = extent * camera_matrix[0, 0] / (size * max(shape))
+                if depth < 2.0 * mesh.radius_m:
+                    continue
+                T = make_pose(R, inverse @ np.array([*centre, 1.0]) * depth)
+                outline = extract_outline(mesh, T, camera_matrix, (height, width), OUTLINE_POINTS)
+                if outline is None or len(outline) < OUTLINE_POINTS // 2:
+                    continue
+                angle = np.arctan2(outline.normal[:, 1], outline.normal[:, 0]) % np.pi
+                bins = np.round(angle * DIRECTIONS / np.pi).astype(int) % DIRECTIONS
+                offset = np.round(outline.pixel - centre).astype(int)
+                total = np.zeros((height, width), np.float32)
+                for k, (dx, dy) in zip(bins, offset, strict=True):
+                    if abs(dx) <= pad and abs(dy) <= pad:
+                        total += padded[k, pad + dy : pad + dy + height, pad + dx : pad + dx + width]
+                # A long outline that fits is better evidence than a short one: noise averages out with its root.
+                steps = np.linalg.norm(np.diff(outline.pixel, axis=0), axis=1)
+                evidence = float(np.sqrt(np.minimum(steps, 12.0).sum() / max(shape))) / len(outline)
+                for _ in range(2):
+                    y, x = np.unravel_index(int(np.argmax(total)), total.shape)
+                    placed = make_pose(R, inverse @ np.array([x, y, 1.0]) * depth)
+                    matches.append(_Match(float(total[y, x]) * evidence, index, placed))
+                    total[max(y - 8, 0) : y + 9, max(x - 8, 0) : x + 9] = -np.inf
+    return matches
+
+
+def _judge(
+    match: _Match,
+    mesh: TrackingMesh,
+    camera_matrix: Array,
+    lab: NDArray[np.float32],
+    moved: NDArray[np.float32],
+    taken: Sequence[Mask],
+    handled: bool,
+) -> float:
+    """Edge score, plus how far the region's colours differ from the ring around it, plus the motion inside it."""
+    height, width = moved.shape
+    window = render_depth(mesh.vertices_m, mesh.faces, match.T_camera_object, camera_matrix)
+    if window is None:
+        return -np.inf
+    silhouette = window.mask_in_image(width, height)
+    area = np.count_nonzero(silhouette)
+    if area < 0.6 * np.count_nonzero(window.mask) or area < 30:
+        return -np.inf
+    if any(np.count_nonzero(silhouette & other) > 0.3 * area for other in taken):
+        return -np.inf
+    ring = cv2.dilate(silhouette.astype(np.uint8), np.ones((11, 11), np.uint8)) > 0
+    ring &= ~silhouette
+    cells = (lab * (8 / 256)).astype(int)
+    code = cells[..., 0] * 64 + cells[..., 1] * 8 + cells[..., 2]
+    inside = np.bincount(code[silhouette], minlength=512) / area
+    outside = np.bincount(code[ring], minlength=512) / max(np.count_nonzero(ring), 1)
+    contrast = 1.0 - float(np.sqrt(inside * outside).sum())
+    motion = float(moved[silhouette].mean())
+    return 1.5 * match.score + 0.5 * contrast + (0.6 * motion if handled else 0.0)
+
+
+def _spread(judged: Sequence[tuple[float, _Match]], count: int) -> list[tuple[float, _Match]]:
+    """The best matches that are not near copies of better ones."""
+    kept: list[tuple[float, _Match]] = []
+    for merit, match in judged:
+        t = match.T_camera_object[:3, 3]
+        same = (
+            np.linalg.norm(t - other.T_camera_object[:3, 3]) < 0.05 * t[2]
+            and np.sum(match.T_camera_object[:3, 0] * other.T_camera_object[:3, 0]) > 0.8
+            for _, other in kept
+        )
+        if np.isfinite(merit) and not any(same):
+            kept.append((merit, match))
+        if len(kept) == count:
+            break
+    return kept
+
+
+def _grown(box: Box, share: float, rgb: Image) -> Box:
+    x, y, w, h = box
+    x_a, y_a = max(x - share * w, 0.0), max(y - share * h, 0.0)
+    x_b, y_b = min(x + (1 + share) * w, float(rgb.shape[1])), min(y + (1 + share) * h, float(rgb.shape[0]))
+    return x_a, y_a, x_b - x_a, y_b - y_a

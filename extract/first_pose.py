@@ -1,0 +1,182 @@
+"""The first pose of an object: silhouettes of the mesh over many rotations against a mask, the best ones refined.
+
+The object is assumed to stand upright more often than not (people film things on tables), so that rotations with the
+object's +z axis up in the image are tried on a finer grid and win ties; every other rotation is tried as well.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from .geometry import Array, make_pose, super_fibonacci_rotations, transform_points
+from .raster import render_depth
+from .region import TrackingMesh, extract_outline, mask_evidence, refine
+from .segment import Box, Mask, mask_box
+from .video import Image
+
+ELEVATIONS_DEG = (0.0, 8.0, 16.0, 26.0, 38.0, 52.0)
+UPRIGHT_BONUS = 0.04  # in intersection over union: about what a wrong rotation gains by chance
+EDGE_WEIGHT = 0.7
+BOX_WEIGHT = 0.7
+SEARCH_SIDE_PX = 72
+SEARCH_PAD = 0.25  # of the longer side, around the box
+CLEAR_EDGE = 24.0  # grey levels per px
+
+
+@dataclass(frozen=True)
+class PoseCandidate:
+    """One explanation of a mask.
+
+    iou: intersection over union of its silhouette with the mask.  box_iou: of its bounding box with the given box,
+    which counts thin parts that masks lose.  edge: share of its outline that runs along image edges, which tells
+    poses apart where the mask is wrong.
+    """
+
+    T_camera_object: Array
+    iou: float
+    box_iou: float
+    upright: bool
+    edge: float = 0.0
+
+    @property
+    def merit(self) -> float:
+        """What candidates are ranked by."""
+        return self.iou + BOX_WEIGHT * self.box_iou + EDGE_WEIGHT * self.edge + UPRIGHT_BONUS * self.upright
+
+
+def upright_rotation(elevation_deg: float, yaw_deg: float, roll_deg: float = 0.0) -> Array:
+    """(3, 3) R_camera_object of an upright object seen by a camera that looks down by `elevation_deg`.
+
+    yaw_deg turns the object about its own +z; roll_deg tilts it in the image, clockwise as seen.
+    """
+    rotation = Rotation.from_euler("z", roll_deg, degrees=True) * Rotation.from_euler(
+        "x", 90 + elevation_deg, degrees=True
+    )
+    return np.asarray((rotation * Rotation.from_euler("z", yaw_deg, degrees=True)).as_matrix())
+
+
+def find_first_pose(
+    mesh: TrackingMesh,
+    rgb: Image,
+    mask: Mask,
+    camera_matrix: Array,
+    *,
+    box_xywh_px: Box | None = None,
+    continuous_symmetry: bool = False,
+    any_rotation: bool = True,
+    keep: int = 24,
+) -> list[PoseCandidate]:
+    """Poses that explain a mask, best first.
+
+    box_xywh_px: box around the whole object; the mask's own when not given.
+    continuous_symmetry: the mesh looks the same from all sides, so that yaw need not be searched.
+    any_rotation: also try rotations that are not upright (600 of them, spread over SO(3)).
+    """
+    yaws = (0.0,) if continuous_symmetry else np.arange(0.0, 360.0, 10.0)
+    tries = [(upright_rotation(e, float(yaw)), True) for e in ELEVATIONS_DEG for yaw in yaws]
+    if any_rotation:
+        tries += [(R, False) for R in super_fibonacci_rotations(600)]
+    box = box_xywh_px or mask_box(mask)
+    scale = SEARCH_SIDE_PX / max(box[2], box[3])
+    small_mask, small_camera = _shrunk(mask, camera_matrix, box, scale)
+    pad_px = SEARCH_PAD * SEARCH_SIDE_PX
+    small_box = (pad_px, pad_px, box[2] * scale, box[3] * scale)
+    coarse = []
+    for R, upright in tries:
+        T = _placed(mesh, R, small_camera, small_box)
+        coarse.append(PoseCandidate(T, *silhouette_ious(mesh, T, small_camera, small_mask, small_box), upright))
+    coarse.sort(key=lambda c: c.merit, reverse=True)
+
+    bins, colours = mask_evidence(mask)
+    found = []
+    for candidate in coarse[:keep]:
+        result = refine(
+            mesh, candidate.T_camera_object, camera_matrix, bins, colours, steps_px=(4, 3, 2, 1),
+            prior_rotation_rad=0.12, prior_translation=0.05, prior_depth=0.1,
+        )  # fmt: skip
+        found.append(judge(mesh, result.T_camera_object, camera_matrix, rgb, mask, box, candidate.upright))
+    found.sort(key=lambda c: c.merit, reverse=True)
+    return found
+
+
+def judge(
+    mesh: TrackingMesh, T_camera_object: Array, camera_matrix: Array, rgb: Image, mask: Mask, box: Box, upright: bool
+) -> PoseCandidate:
+    """How well a pose explains an image, the mask cut from it and the box around the object."""
+    ious = silhouette_ious(mesh, T_camera_object, camera_matrix, mask, box)
+    edge = edge_score(mesh, T_camera_object, camera_matrix, edge_strength(rgb))
+    return PoseCandidate(T_camera_object, *ious, upright, edge)
+
+
+def silhouette_ious(
+    mesh: TrackingMesh, T_camera_object: Array, camera_matrix: Array, mask: Mask, box_xywh_px: Box
+) -> tuple[float, float]:
+    """Intersection over union of the silhouette, cut to the image, with a mask, and of its bounding box with a box."""
+    window = render_depth(mesh.vertices_m, mesh.faces, T_camera_object, camera_matrix)
+    if window is None:
+        return 0.0, 0.0
+    silhouette = window.mask_in_image(mask.shape[1], mask.shape[0])
+    if not silhouette.any():
+        return 0.0, 0.0
+    iou = np.count_nonzero(silhouette & mask) / np.count_nonzero(silhouette | mask)
+    return float(iou), _box_iou(mask_box(silhouette), box_xywh_px)
+
+
+def _box_iou(a: Box, b: Box) -> float:
+    width = min(a[0] + a[2], b[0] + b[2]) - max(a[0], b[0])
+    height = min(a[1] + a[3], b[1] + b[3]) - max(a[1], b[1])
+    shared = max(width, 0.0) * max(height, 0.0)
+    return shared / (a[2] * a[3] + b[2] * b[3] - shared)
+
+
+def edge_strength(rgb: Image) -> Array:
+    """(H, W, 2) image gradient, the largest of the three channels, scaled so that a clear edge has length 1."""
+    blurred = cv2.GaussianBlur(rgb, (0, 0), 1.0).astype(np.float32)
+    gradient = np.stack([cv2.Sobel(blurred, cv2.CV_32F, *order, scale=1 / 8) for order in ((1, 0), (0, 1))], axis=-1)
+    channel = np.argmax(np.linalg.norm(gradient, axis=-1), axis=-1)
+    strongest = np.take_along_axis(gradient, channel[..., None, None], axis=2)[:, :, 0]
+    return np.asarray(strongest / CLEAR_EDGE, float)
+
+
+def edge_score(mesh: TrackingMesh, T_camera_object: Array, camera_matrix: Array, strength: Array) -> float:
+    """Share of the outline, in [0, 1], along which the image has an edge of the same direction within 2 px."""
+    outline = extract_outline(mesh, T_camera_object, camera_matrix, strength.shape[:2])
+    if outline is None:
+        return 0.0
+    best = np.zeros(len(outline))
+    for offset in range(-2, 3):
+        x, y = np.round(outline.pixel + offset * outline.normal).astype(int).T
+        inside = (x >= 0) & (y >= 0) & (x < strength.shape[1]) & (y < strength.shape[0])
+        along = np.abs(np.sum(strength[y * inside, x * inside] * outline.normal, axis=1))
+        best = np.maximum(best, np.where(inside, along, 0.0))
+    return float(np.mean(np.minimum(best, 1.0)))
+
+
+def _placed(mesh: TrackingMesh, R: Array, camera_matrix: Array, box: Box) -> Array:
+    """The pose with rotation R whose projection has the box's size and centre (FreePose, eq. 2)."""
+    target = np.array([box[0] + box[2] / 2, box[1] + box[3] / 2])
+    inverse = np.linalg.inv(camera_matrix)
+    depth, aim = 10.0 * mesh.radius_m, target.copy()
+    for _ in range(3):
+        T = make_pose(R, inverse @ np.array([*aim, 1.0]) * depth)
+        points = transform_points(T, mesh.vertices_m)
+        pixels = (points @ camera_matrix.T)[:, :2] / np.maximum(points[:, 2:], 1e-6)
+        low, high = pixels.min(axis=0), pixels.max(axis=0)
+        depth *= float(np.sqrt(np.prod(high - low) / (box[2] * box[3])))
+        depth = max(depth, 1.2 * mesh.radius_m)
+        aim += target - (low + high) / 2
+    return make_pose(R, inverse @ np.array([*aim, 1.0]) * depth)
+
+
+def _shrunk(mask: Mask, camera_matrix: Array, box: Box, scale: float) -> tuple[Mask, Array]:
+    """The mask around its box at a small size, and the camera that sees it so."""
+    pad = SEARCH_PAD * max(box[2], box[3])
+    x0, y0 = box[0] - pad, box[1] - pad
+    size = (round((box[2] + 2 * pad) * scale), round((box[3] + 2 * pad) * scale))
+    warp = np.array([[scale, 0.0, -x0 * scale], [0.0, scale, -y0 * scale]])
+    small = cv2.warpAffine(mask.astype(np.uint8) * 255, warp, size, flags=cv2.INTER_AREA) > 127
+    return np.asarray(small), np.vstack([warp, [0.0, 0.0, 1.0]]) @ camera_matrix
