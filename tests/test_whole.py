@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 import json
+import shlex
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -73,3 +78,25 @@ def test_a_lost_file_is_made_again_and_nothing_else(folder: Path) -> None:
     assert (folder / "mug.joints.npz").read_bytes() == content
     after = {name: stage["finished"] for name, stage in record(folder)["stages"].items()}
     assert {name for name in after if after[name] != finished[name]} <= {"retarget"}
+
+
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
+def test_a_command_stopped_in_its_midst_leaves_nothing_half_done(tmp_path: Path, how: signal.Signals) -> None:
+    out = tmp_path / "clip"
+    words = ["synthesize", "--out", str(out), "--seconds", "1", "--size", "160", "120"]
+    command = [str(Path(sys.executable).with_name("vid2demo")), *words]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    deadline_s = time.monotonic() + 120
+    while not list(out.glob(".video.*.part.mp4")) and time.monotonic() < deadline_s:
+        time.sleep(0.01)
+    process.send_signal(how)
+    _, told = process.communicate(timeout=120)
+    assert not (out / "video.mp4").exists()
+    assert record(out)["stages"] == {}
+    if how == signal.SIGINT:
+        assert process.returncode == 130
+        assert told.strip().endswith(f"to go on, type again: vid2demo {shlex.join(words)}")
+        assert not list(out.glob(".*"))
+    assert cli.main(words) == 0
+    assert set(record(out)["stages"]) == {"synthesize"}
+    assert not list(out.glob(".*"))
