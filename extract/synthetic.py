@@ -7,7 +7,7 @@ pixel is (0.5, 0.5) and the principal point of the renderer is exactly (width / 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,9 @@ from numpy.typing import NDArray
 from .errors import UserError
 from .files import write_json
 from .geometry import Array, invert_pose
-from .synthetic_motion import Camera, PourShape, place_camera, plan_pour
+from .progress import Progress
+from .synthetic_hand import Grip, grips
+from .synthetic_motion import Camera, PourPath, PourShape, place_camera, plan_pour
 from .synthetic_scene import OBJECT, RECEPTACLE, Scene, load_mujoco
 from .track import ObjectTrack
 from .vessel_types import Vessel
@@ -28,11 +30,10 @@ from .video import Image, VideoWriter, read_video_info
 
 SCHEMA = "vid2demo/synthetic-clip"
 VISIBLE_FRACTION = 0.1
+ENOUGH_VISIBLE = 0.5
 MAX_FRAMES = 3000
 MAX_SIDE_PX = 1920
 MIN_SIDE_PX = 64
-
-Progress = Callable[[int, int, str], None]
 
 
 @dataclass(frozen=True)
@@ -96,15 +97,16 @@ def synthesize(
     video, count = out / "video.mp4", len(path.time_s)
     visible = np.zeros(count)
     boxes: dict[str, list[int] | None] = {}
-    with Scene(rng, vessel, bowl, path, camera, size, occluder) as scene, VideoWriter(video, fps) as writer:
+    scene_seed = int(rng.integers(1 << 31))
+    choices: list[Grip | None] = [*grips(rng, vessel.grasps)] if occluder else [None]
+    with _scene(scene_seed, vessel, bowl, path, camera, size, choices) as scene, VideoWriter(video, fps) as writer:
         notes = scene.notes
         for k in range(count):
             picture = scene.render(k)
             writer.write(sensor.expose(picture, rng) if sensor else picture)
-            labels = scene.labels(k)
-            alone = np.count_nonzero(scene.labels(k, only=OBJECT) == OBJECT)
-            visible[k] = np.count_nonzero(labels == OBJECT) / max(alone, 1)
+            visible[k] = scene.visible_fraction(k)
             if k == 0:
+                labels = scene.labels(k)
                 boxes = {"object": _box_of(labels == OBJECT), "receptacle": _box_of(labels == RECEPTACLE)}
             if progress is not None:
                 progress(k + 1, count, "rendering")
@@ -189,6 +191,31 @@ def _check(seconds: float, fps: float, size: tuple[int, int]) -> None:
         raise UserError(
             f"size is {size[0]}x{size[1]}; width and height must be even and between {MIN_SIDE_PX} and {MAX_SIDE_PX} px"
         )
+
+
+def _scene(
+    seed: int,
+    vessel: Vessel,
+    receptacle: Vessel,
+    path: PourPath,
+    camera: Camera,
+    size_px: tuple[int, int],
+    choices: Sequence[Grip | None],
+) -> Scene:
+    """The scene with the first hand that leaves enough of the vessel to see, else with the one that leaves most."""
+    frames = np.linspace(0, len(path.time_s) - 1, 6).astype(int)
+
+    def built(grip: Grip | None) -> Scene:
+        return Scene(np.random.default_rng(seed), vessel, receptacle, path, camera, size_px, grip)
+
+    least = []
+    for grip in choices:
+        scene = built(grip)
+        least.append(min(scene.visible_fraction(int(k)) for k in frames))
+        if least[-1] >= ENOUGH_VISIBLE:
+            return scene
+        scene.close()
+    return built(choices[int(np.argmax(least))])
 
 
 def _choose(rng: np.random.Generator, word: str) -> str:

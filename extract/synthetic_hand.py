@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,22 +23,32 @@ FOREARM: tuple[Capsule, ...] = (
 )
 
 
-def choose_grasp(rng: np.random.Generator, grasps: Sequence[GraspRegion]) -> GraspRegion:
-    """Mostly the handle where there is one, sometimes around the body."""
-    handles = [g for g in grasps if g.kind == "handle"]
-    bodies = [g for g in grasps if g.kind == "body"]
-    use_handle = rng.random() < 0.85
-    return ((handles or bodies) if use_handle else (bodies or handles))[0]
+@dataclass(frozen=True)
+class Grip:
+    """Where the hand holds; side: +1 or -1, on which side of the palm the fingers are (the thumb is on the other)."""
+
+    grasp: GraspRegion
+    side: int
 
 
-def hand_capsules(rng: np.random.Generator, grasp: GraspRegion) -> list[Capsule]:
+def grips(rng: np.random.Generator, grasps: Sequence[GraspRegion]) -> list[Grip]:
+    """All ways to hold a vessel, best liked first: mostly the handle where there is one, sometimes around the body."""
+    handles = [g for g in grasps if g.kind == "handle"][:1]
+    bodies = [g for g in grasps if g.kind == "body"][:1]
+    liked = handles + bodies if rng.random() < 0.85 else bodies + handles
+    side = int(rng.choice([-1, 1]))
+    return [Grip(grasp, sign) for grasp in liked for sign in (side, -side)]
+
+
+def hand_capsules(grip: Grip) -> list[Capsule]:
     """Palm, four fingers and a thumb around a grasp region: capsules (start, end, radius) in the object frame, m."""
+    grasp = grip.grasp
     center, into, along = (np.asarray(v, float) for v in (grasp.center_m, grasp.approach, grasp.axis))
     along = along - into * (along @ into)
     along /= np.linalg.norm(along)
     if along[2] < -0.2:
         along = -along
-    side = np.cross(along, into) * rng.choice([-1.0, 1.0])
+    side = np.cross(along, into) * grip.side
     half = 0.5 * float(grasp.width_m) + 0.007
     reach = float(np.clip(half, 0.012, 0.035))
 
@@ -59,13 +70,15 @@ def hand_capsules(rng: np.random.Generator, grasp: GraspRegion) -> list[Capsule]
     return parts
 
 
-def forearm_poses(rng: np.random.Generator, grasp: GraspRegion, path: PourPath) -> Array:
-    """T_world_forearm (N, 4, 4): origin at the wrist, +z toward a shoulder behind the table on the vessel's side."""
+def forearm_poses(rng: np.random.Generator, grip: Grip, path: PourPath) -> Array:
+    """T_world_forearm (N, 4, 4): origin at the wrist, +z toward a shoulder above and behind, on the vessel's side."""
+    grasp = grip.grasp
     wrist = np.asarray(grasp.center_m, float) - _WRIST_BACK_M * np.asarray(grasp.approach, float)
-    shoulder = np.array([-path.side * rng.uniform(0.25, 0.5), rng.uniform(0.25, 0.45), rng.uniform(0.3, 0.5)])
+    wrists = np.array([transform_points(T, wrist[None])[0] for T in path.T_world_object])
+    shoulder = np.array([-path.side * rng.uniform(0.3, 0.6), rng.uniform(0.08, 0.3), 0.0])
+    shoulder[2] = wrists[:, 2].max() + rng.uniform(0.2, 0.4)  # so that the arm leaves the picture at its upper edge
     poses = []
-    for T in path.T_world_object:
-        at = transform_points(T, wrist[None])[0]
+    for at in wrists:
         z = (shoulder - at) / np.linalg.norm(shoulder - at)
         x = np.cross(z, [0.0, 0.0, 1.0])
         x /= np.linalg.norm(x)

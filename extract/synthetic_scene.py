@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from .geometry import Array
-from .synthetic_hand import FOREARM, choose_grasp, forearm_poses, hand_capsules
+from .synthetic_hand import FOREARM, Grip, forearm_poses, hand_capsules
 from .synthetic_look import vessel_look
 from .synthetic_motion import Camera, PourPath
 from .synthetic_textures import Image, random_color, table_texture, wall_texture
@@ -45,7 +45,7 @@ class Scene:
         path: PourPath,
         camera: Camera,
         size_px: tuple[int, int],
-        occluder: bool,
+        grip: Grip | None,
     ) -> None:
         mujoco = load_mujoco()
         self.notes: dict[str, Any] = {}
@@ -67,8 +67,8 @@ class Scene:
         self._add_vessel("object", vessel, OBJECT)
         self._add_vessel("receptacle", receptacle, RECEPTACLE)
         moving = [path.T_world_object, np.broadcast_to(path.T_world_receptacle, path.T_world_object.shape)]
-        if occluder:
-            hand, forearm = self._add_hand(vessel, path)
+        if grip is not None:
+            hand, forearm = self._add_hand(grip, path)
             moving += [hand, forearm]
         self._moving = np.stack(moving, axis=1)
         self._model = spec.compile()
@@ -106,6 +106,11 @@ class Scene:
         groups = np.append(np.asarray(self._model.geom_group), SCENERY)  # id -1 (nothing hit) reads the last entry
         return np.asarray(groups[ids], np.int8)
 
+    def visible_fraction(self, k: int) -> float:
+        """Share of the object's pixels in frame k that nothing hides."""
+        alone = np.count_nonzero(self.labels(k, only=OBJECT) == OBJECT)
+        return float(np.count_nonzero(self.labels(k) == OBJECT) / max(alone, 1))
+
     def _pose(self, k: int) -> None:
         T = self._moving[k]
         self._data.mocap_pos[:] = T[:, :3, 3]
@@ -115,16 +120,16 @@ class Scene:
 
     def _lamps(self) -> None:
         rng, spec = self._rng, self._spec
-        ambient = rng.uniform(0.35, 0.5)
+        ambient = rng.uniform(0.3, 0.42)
         spec.visual.headlight.ambient = [ambient] * 3
-        spec.visual.headlight.diffuse = [rng.uniform(0.1, 0.25)] * 3
+        spec.visual.headlight.diffuse = [rng.uniform(0.05, 0.18)] * 3
         spec.visual.headlight.specular = [0.1] * 3
         for k in range(2):
             azimuth, elevation = rng.uniform(-0.95 * np.pi, -0.05 * np.pi), np.deg2rad(rng.uniform(35, 70))
             toward = np.array(
                 [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]
             )
-            strength = (rng.uniform(0.45, 0.65), rng.uniform(0.15, 0.3))[k]
+            strength = (rng.uniform(0.4, 0.6), rng.uniform(0.1, 0.22))[k]
             tint = 1 + np.array([1, 0, -1]) * rng.uniform(-0.08, 0.12)
             spec.worldbody.add_light(
                 pos=1.2 * toward,
@@ -225,7 +230,7 @@ class Scene:
         body = self._spec.worldbody.add_body(name=name, mocap=True)
         body.add_geom(type=self._mujoco.mjtGeom.mjGEOM_MESH, meshname=name, material=material, group=group)
 
-    def _add_hand(self, vessel: Vessel, path: PourPath) -> tuple[Array, Array]:
+    def _add_hand(self, grip: Grip, path: PourPath) -> tuple[Array, Array]:
         """The hand moves with the vessel, the forearm leads from the wrist toward a shoulder out of view.
 
         Returns the poses (N, 4, 4) of both bodies.
@@ -233,13 +238,12 @@ class Scene:
         rng, capsule = self._rng, self._mujoco.mjtGeom.mjGEOM_CAPSULE
         skin = np.array([0.92, 0.7, 0.58]) * rng.uniform(0.45, 1.05) * (1 + 0.05 * rng.uniform(-1, 1, 3))
         sleeve = random_color(rng, (0.0, 0.7), (0.15, 0.95))
-        grasp = choose_grasp(rng, vessel.grasps)
-        self.notes["hand"] = {"grasp": grasp.kind}
-        limbs = {"hand": [(*part, skin * rng.uniform(0.96, 1.04)) for part in hand_capsules(rng, grasp)]}
+        self.notes["hand"] = {"grasp": grip.grasp.kind}
+        limbs = {"hand": [(*part, skin * rng.uniform(0.96, 1.04)) for part in hand_capsules(grip)]}
         limbs["forearm"] = [(*part, (skin, sleeve)[k]) for k, part in enumerate(FOREARM)]
         for name, parts in limbs.items():
             body = self._spec.worldbody.add_body(name=name, mocap=True)
             for start, end, radius, rgb in parts:
                 rgba = [*np.clip(rgb, 0, 1), 1.0]
                 body.add_geom(type=capsule, fromto=[*start, *end], size=[radius, 0, 0], rgba=rgba, group=HAND)
-        return path.T_world_object, forearm_poses(rng, grasp, path)
+        return path.T_world_object, forearm_poses(rng, grip, path)

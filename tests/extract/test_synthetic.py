@@ -9,11 +9,12 @@ import pytest
 from vid2demo.extract.errors import UserError
 from vid2demo.extract.geometry import invert_pose, project, transform_points
 from vid2demo.extract.synthetic import SyntheticClip, synthesize
+from vid2demo.extract.synthetic_hand import grips
 from vid2demo.extract.synthetic_motion import PourPath, PourShape, minimum_jerk, place_camera, plan_pour
 from vid2demo.extract.synthetic_scene import HAND, OBJECT, Scene
 from vid2demo.extract.synthetic_textures import TABLE_KINDS, WALL_KINDS, table_texture, wall_texture
 from vid2demo.extract.track import ObjectTrack
-from vid2demo.extract.vessels import Vessel, make_vessel
+from vid2demo.extract.vessels import CATEGORIES, Vessel, make_vessel
 from vid2demo.extract.video import iterate_frames, read_video_info
 
 SMALL = {"seconds": 0.4, "fps": 25.0, "size": (160, 120)}
@@ -62,7 +63,7 @@ def test_projected_truth_coincides_with_the_render(category: str, seed: int) -> 
     size = (640, 480)
     camera, _ = place_camera(rng, path, shape, size)
     T_camera_object = invert_pose(camera.T_world_camera) @ path.T_world_object
-    with Scene(rng, vessel, receptacle, path, camera, size, occluder=False) as scene:
+    with Scene(rng, vessel, receptacle, path, camera, size, grip=None) as scene:
         for k in (0, 90):
             rendered = scene.labels(k, only=OBJECT) == OBJECT
             drawn = silhouette(vessel, T_camera_object[k], camera.camera_matrix, size)
@@ -179,12 +180,13 @@ def test_the_vessel_stays_in_a_fair_sized_picture(seed: int) -> None:
         assert np.all(pixels < [640, 480])
 
 
-def test_hand_hides_a_part_and_can_be_left_out(tmp_path: Path) -> None:
+def test_hand_hides_a_part_and_can_be_left_out() -> None:
     vessel, receptacle, shape, path = planned("mug", 2)
     camera, _ = place_camera(np.random.default_rng(2), path, shape, (160, 120))
-    with Scene(np.random.default_rng(2), vessel, receptacle, path, camera, (160, 120), occluder=True) as scene:
+    grip = grips(np.random.default_rng(2), vessel.grasps)[0]
+    with Scene(np.random.default_rng(2), vessel, receptacle, path, camera, (160, 120), grip) as scene:
         assert np.count_nonzero(scene.labels(60) == HAND) > 200
-    with Scene(np.random.default_rng(2), vessel, receptacle, path, camera, (160, 120), occluder=False) as scene:
+    with Scene(np.random.default_rng(2), vessel, receptacle, path, camera, (160, 120), grip=None) as scene:
         assert not np.any(scene.labels(60) == HAND)
 
 
@@ -248,3 +250,23 @@ def test_an_interrupted_clip_leaves_no_half_files(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         synthesize("mug", 0, tmp_path, receptacle="mug", progress=stop, **SMALL)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("category", ["cup", "wine_glass", "bowl"])
+def test_the_hand_leaves_enough_to_see(category: str, tmp_path: Path) -> None:
+    for seed in range(2):
+        clip = synthesize(category, seed, tmp_path, seconds=1.0, fps=6.0, size=(160, 120))
+        assert clip.visible_fraction.mean() > 0.4
+        assert clip.visible_fraction.min() > 0.2
+        assert clip.truth.visible.all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("category", CATEGORIES)
+def test_every_category_pours(category: str, tmp_path: Path) -> None:
+    clip = synthesize(category, 11, tmp_path, seconds=6.0, fps=5.0, size=(160, 120), receptacle="mug")
+    assert len(clip.truth) == 30
+    assert clip.visible_fraction.min() > 0.2
+    assert clip.truth.visible.all()
+    assert clip.boxes_xywh_px["object"] is not None
+    assert clip.boxes_xywh_px["receptacle"] is not None
