@@ -117,7 +117,7 @@ def search_placement(stage: Stage, rng: np.random.Generator, *, thorough: bool =
     cost = _costs(stage, batch, q, grasps, stage.time_s[knots])
     if thorough:
         batch, q, cost = _refine(stage, batch, q, cost, T_hand, grasps, knots, pour, rng)
-    return _best_in_full(stage, batch, q, cost, grasps, knots, pour, tries=24 if thorough else 4, collide=thorough)
+    return _best_in_full(stage, batch, q, cost, grasps, tries=24 if thorough else 4, thorough=thorough)
 
 
 def _spread_knots(T: Array) -> NDArray[np.int64]:
@@ -280,27 +280,26 @@ def _best_in_full(
     q: Array,
     cost: Array,
     grasps: list[Grasp],
-    knots: NDArray[np.int64],
-    pour: int,
     *,
     tries: int,
-    collide: bool,
+    thorough: bool,
 ) -> Placement | Shortfall:
     """Follow the best few through every knot; the first without collisions wins, else the least colliding."""
     chosen_index = _diverse(batch, cost, tries)
     chosen = batch.take(chosen_index)
     T_stage, T_object_hand = chosen.transforms(), np.stack([grasps[g].T_object_hand for g in chosen.grasp])
-    # From the pour to the start, then along the motion as `retarget` will go: near the start posture.
-    towards, _ = follow(T_stage, stage.T_object, T_object_hand, q[chosen_index, pour], knots[pour], Q_HOME_RAD, 0.05)
-    q_start, _ = solve_ik(T_stage @ stage.T_object[0] @ T_object_hand, towards[:, 0], iterations=10, damping=0.005)
-    q_full, miss = follow(T_stage, stage.T_object, T_object_hand, q_start, 0, q_start, 1.0)
-    full_cost = _costs(stage, chosen, q_full, grasps, stage.time_s)
+    # From the start on as `retarget` will go: near the start posture.
+    stride = 1 if thorough else 4
+    time_s, T_object = stage.time_s[::stride], stage.T_object[::stride]
+    q_start, _ = solve_ik(T_stage @ T_object[0] @ T_object_hand, q[chosen_index, 0], iterations=10, damping=0.005)
+    q_full, miss = follow(T_stage, T_object, T_object_hand, q_start)
+    full_cost = _costs(stage, chosen, q_full, grasps, time_s)
     reached = miss.max(axis=1) < POSITION_TOLERANCE_M + 0.2 * ROTATION_TOLERANCE_RAD
     fallback: Placement | None = None
     for rank in [int(i) for i in np.argsort(full_cost) if reached[i]]:
         grasp, T = grasps[chosen.grasp[rank]], T_stage[rank]
         collisions: list[Collision] = []
-        if collide:
+        if thorough:
             T_receptacle = None if stage.T_receptacle is None else T @ stage.T_receptacle
             checker = CollisionChecker(stage.vessel, grasp.T_hand_object, grasp.width_m, stage.receptacle, T_receptacle)
             collisions = checker.check(q_full[rank], every=max(1, len(stage.time_s) // 40))
@@ -312,7 +311,7 @@ def _best_in_full(
     if fallback is not None:
         return fallback
     worst = miss[int(np.argmin(miss.max(axis=1)))]
-    bad = stage.time_s[worst > POSITION_TOLERANCE_M]
+    bad = time_s[worst > POSITION_TOLERANCE_M]
     return Shortfall(float(bad.min()), float(bad.max()), float(worst.max()))
 
 
@@ -334,34 +333,22 @@ def _diverse(batch: _Batch, cost: Array, count: int) -> NDArray[np.int64]:
     return np.array(kept, np.int64)
 
 
-def follow(
-    T_world_stage: Array,
-    T_object: Array,
-    T_object_hand: Array,
-    q_rad: Array,
-    knot: int,
-    q_rest_rad: Array,
-    rest_gain: float,
-) -> tuple[Array, Array]:
-    """Joint motions (C, N, 7) of C placements through every knot, from q (C, 7) at `knot` to both ends.
+def follow(T_world_stage: Array, T_object: Array, T_object_hand: Array, q_start_rad: Array) -> tuple[Array, Array]:
+    """Joint motions (C, N, 7) of C placements through every knot, from q (C, 7), the redundancy drawing back there.
 
-    T_world_stage, T_object_hand: (C, 4, 4); T_object: (N, 4, 4). The redundancy draws near `q_rest_rad`. Also returns
-    the misses (C, N) in m, 1 rad of rotation counting as 0.2 m.
+    T_world_stage, T_object_hand: (C, 4, 4); T_object: (N, 4, 4). Also returns the misses (C, N) in m, 1 rad of rotation
+    counting as 0.2 m.
     """
-    count = len(T_object)
-    q = np.zeros((len(q_rad), count, 7))
-    miss = np.zeros((len(q_rad), count))
-    previous = q_rad
-    for k in [*range(knot, -1, -1), *range(knot + 1, count)]:
-        if k == knot + 1:
-            previous = q[:, knot]
-        target = T_world_stage @ T_object[k] @ T_object_hand
+    q = np.zeros((len(q_start_rad), len(T_object), 7))
+    miss = np.zeros(q.shape[:2])
+    previous = q_start_rad
+    for k, T in enumerate(T_object):
         previous, error = solve_ik(
-            target,
+            T_world_stage @ T @ T_object_hand,
             previous,
-            iterations=8 if k == knot else 3,
-            q_rest_rad=q_rest_rad,
-            rest_gain=rest_gain,
+            iterations=3,
+            q_rest_rad=q_start_rad,
+            rest_gain=1.0,
             damping=0.01,
         )
         q[:, k] = previous

@@ -1,0 +1,104 @@
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from vid2demo.demos.feasibility import feasibility
+from vid2demo.demos.joints import JointTrajectory
+from vid2demo.demos.retarget import retarget
+from vid2demo.envs.kinematics import panda_chain
+from vid2demo.envs.panda import DQ_MAX_RAD_S, Q_HOME_RAD, Q_MAX_RAD, TAU_MAX_NM
+from vid2demo.envs.reference import Reference, minimum_jerk, vessel_to_header
+from vid2demo.extract.geometry import Array, make_pose
+from vid2demo.extract.vessels import make_vessel
+
+
+def moved(target_rad: Array, knots: int = 51) -> tuple[Reference, JointTrajectory]:
+    """The reference that the arm makes itself on its way from home to a configuration, and its retargeting."""
+    q = Q_HOME_RAD + minimum_jerk(np.linspace(0, 1, knots))[:, None] * (target_rad - Q_HOME_RAD)
+    T_hand_object = make_pose(None, (0.0, 0.0, 0.05))
+    header = {
+        "vessel": vessel_to_header(make_vessel("mug")),
+        "T_hand_object": T_hand_object.tolist(),
+        "q_start_rad": q[0].tolist(),
+        "notes": ["The receptacle stands where it was seen."],
+        "scale": 0.9,
+        "time_stretch": 1.25,
+    }
+    reference = Reference.from_poses(panda_chain().hand(q) @ T_hand_object, np.arange(knots) / 25.0, header)
+    return reference, retarget(reference)
+
+
+@pytest.fixture(scope="module")
+def easy() -> tuple[Reference, JointTrajectory]:
+    return moved(Q_HOME_RAD + np.array([0.4, 0.2, 0.0, 0.2, 0.0, 0.3, 0.2]))
+
+
+def test_an_easy_motion_is_feasible_and_told_in_words(easy: tuple[Reference, JointTrajectory]) -> None:
+    findings = feasibility(*easy)
+    assert findings["feasible"] is True
+    assert findings["words"][0] == "The arm can do this motion."
+    assert "The receptacle stands where it was seen." in findings["words"]
+    assert any("1.25 times as long as the human" in sentence for sentence in findings["words"])
+    assert all(sentence.endswith(".") for sentence in findings["words"])
+    assert findings["scale"] == 0.9
+    json.dumps(findings, allow_nan=False)
+
+
+def test_figures_are_those_of_the_trajectory(easy: tuple[Reference, JointTrajectory]) -> None:
+    reference, joints = easy
+    findings = feasibility(reference, joints)
+    margins = findings["joint_limit_margin_rad"]
+    assert [entry["joint"] for entry in margins] == [1, 2, 3, 4, 5, 6, 7]
+    last = margins[0]
+    assert last["value"] == pytest.approx(float((Q_MAX_RAD - joints.q_rad)[:, 0].min()))
+    assert last["at_s"] == pytest.approx(joints.time_s[int(joints.q_rad[:, 0].argmax())])
+    speed = np.abs(joints.dq_rad_s) / DQ_MAX_RAD_S
+    assert [entry["value"] for entry in findings["speed_part_of_limit"]] == pytest.approx(speed.max(axis=0).tolist())
+    assert findings["position_error_m"]["max"] < 1e-4
+
+
+def test_every_broken_limit_is_named(easy: tuple[Reference, JointTrajectory]) -> None:
+    reference, joints = easy
+    q, dq, tau = joints.q_rad.copy(), joints.dq_rad_s.copy(), joints.tau_nm.copy()
+    q[20, 4] = 3.1
+    dq[10, 6] = 1.2 * DQ_MAX_RAD_S[6]
+    tau[30, 1] = -1.1 * TAU_MAX_NM[1]
+    findings = feasibility(reference, dataclasses.replace(joints, q_rad=q, dq_rad_s=dq, tau_nm=tau))
+    assert findings["feasible"] is False
+    verdict = findings["words"][0]
+    assert "joint 5 exceeds its position limit" in verdict
+    assert "joint 7 exceeds its speed limit" in verdict
+    assert "joint 2 exceeds its torque limit" in verdict
+
+
+def test_a_lagging_arm_is_told_with_distance_and_time(easy: tuple[Reference, JointTrajectory]) -> None:
+    reference, joints = easy
+    late = dataclasses.replace(joints, q_rad=np.concatenate([joints.q_rad[:1].repeat(8, axis=0), joints.q_rad[:-8]]))
+    findings = feasibility(reference, late)
+    assert findings["feasible"] is False
+    assert "cm off the reference (at " in findings["words"][0]
+
+
+def test_collisions_make_it_infeasible(easy: tuple[Reference, JointTrajectory]) -> None:
+    reference, joints = easy
+    hit = {"first": "hand", "second": "table", "time_s": 1.2, "depth_m": 0.01}
+    findings = feasibility(reference.with_header(feasibility={"collisions": [hit]}), joints)
+    assert findings["feasible"] is False
+    assert "the hand touches the table around 1.2 s" in findings["words"][0]
+
+
+def test_tight_margins_are_warned_of(easy: tuple[Reference, JointTrajectory]) -> None:
+    reference, joints = easy
+    q = joints.q_rad.copy()
+    q[30, 6] = Q_MAX_RAD[6] - 0.02
+    findings = feasibility(reference, dataclasses.replace(joints, q_rad=q))
+    assert any("tight" in sentence for sentence in findings["words"])
+
+
+def test_different_clocks_are_refused(easy: tuple[Reference, JointTrajectory]) -> None:
+    reference, joints = easy
+    with pytest.raises(ValueError, match="knots"):
+        feasibility(reference.stretched(2.0), joints)
