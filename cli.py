@@ -218,7 +218,7 @@ class Collect(Staged):
         from .run import collect_stage
 
         chosen = {"episodes": self.episodes, "seed": self.seed}
-        stage = collect_stage(self.reference, self.out, episodes=self.episodes, seed=self.seed)
+        stage = collect_stage(self.reference, self.out, episodes=self.episodes, seed=self.seed, replace=self.force)
         return self.do_stages([stage], {"reference": self.reference, **chosen})
 
 

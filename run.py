@@ -202,13 +202,14 @@ def simulate_stage(reference: Path, joints: Path, video: Path | None, folder: Pa
     )
 
 
-def collect_stage(reference: Path, folder: Path, *, episodes: int, seed: int) -> Stage:
-    """Reference -> dataset/ of verified episodes."""
+def collect_stage(reference: Path, folder: Path, *, episodes: int, seed: int, replace: bool = False) -> Stage:
+    """Reference -> dataset/ of verified episodes. replace: also where a dataset of another reference is."""
 
     def work(progress: Progress) -> Mapping[str, Any]:
         from .demos.collect import collect
 
-        return plain(collect(reference, folder / "dataset", episodes=episodes, seed=seed, progress=progress)) or {}
+        dataset = folder / "dataset"
+        return collect(reference, dataset, episodes=episodes, seed=seed, force=replace, progress=progress)
 
     return Stage(
         "collect",
@@ -253,7 +254,8 @@ def stages_of(settings: RunSettings, folder: Path) -> list[Stage]:
         reference_stage(track, receptacle, folder, scale=settings.scale, seed=settings.seed),
         retarget_stage(reference, folder),
         simulate_stage(reference, joints_path(track, folder), settings.video, folder),
-        collect_stage(reference, folder, episodes=settings.episodes, seed=settings.seed),
+        # The folder is this video's, so an older dataset in it is of an older motion of the same.
+        collect_stage(reference, folder, episodes=settings.episodes, seed=settings.seed, replace=True),
     ]
     return [*stages, report_stage(folder, stages)]
 
