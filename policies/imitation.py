@@ -8,15 +8,18 @@ from typing import Any
 
 from ..demos.stored import read_info
 
-# Small enough to learn on a laptop's CPU; ACT's own sizes otherwise.
+# Small enough to learn on a laptop's CPU; ACT's own sizes otherwise. Without the variational part, which is there for
+# people who do the same thing in different ways: what `collect` writes is one way per start.
 SMALL_ACT: dict[str, Any] = {
     "dim_model": 128,
     "dim_feedforward": 256,
     "n_heads": 4,
     "n_encoder_layers": 1,
-    "n_vae_encoder_layers": 1,
+    "use_vae": "false",
     "chunk_size": 25,
     "n_action_steps": 25,
+    "optimizer_lr": 3e-4,
+    "optimizer_lr_backbone": 3e-4,
 }
 
 
