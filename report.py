@@ -130,7 +130,7 @@ def verdict(found: Found) -> tuple[str, bool]:
     so_far = f"The {found.name} was followed in the video" if found.tracks else "There is nothing to show yet"
     sentence = f"The robot {_join(said)}" if said else so_far
     if episodes:
-        sentence += f"; {episodes} verified demonstrations are in the dataset"
+        sentence += f"; {episodes} verified demonstration{'s are' if episodes != 1 else ' is'} in the dataset"
     if missing := [stage for stage in _STAGES if stage not in done]:
         sentence += f". Not done: {', '.join(missing)}"
         well = False
@@ -259,10 +259,8 @@ def _robot_plots(found: Found) -> str:
     else:
         if _fits(series, "tilt_rad"):
             tilts = [Line("reached", np.rad2deg(series["tilt_rad"]))]
-            if found.reference is not None:
-                ref = found.reference
-                asked = np.interp(time_s, ref.time_s, np.rad2deg(ref.tilt_rad), right=math.nan)
-                tilts.append(Line("asked", asked, 2, dashed=True))
+            if _fits(series, "reference_tilt_rad"):
+                tilts.append(Line("asked", np.rad2deg(series["reference_tilt_rad"]), 2, dashed=True))
             parts.append(chart(f"{found.name}: tilt", "°", time_s, tilts, limits=(0.0, None), clock=clock))
         for key, label, unit, factor, good in (
             ("position_error_m", "position error", "mm", 1000.0, _GOOD_POSITION_MM),
@@ -346,9 +344,8 @@ def _again(found: Found) -> str | None:
 
 def _tables(found: Found) -> str:
     timings = _timings(found)
-    stages = {name: _duration(seconds) for name, seconds in timings.items()} | {
-        name: "not done" for name in _STAGES if found.record and name not in timings
-    }
+    names = dict.fromkeys((*_STAGES, *timings)) if found.record else timings
+    stages = {name: _duration(timings[name]) if name in timings else "not done" for name in names}
     if timings:
         stages["together"] = _duration(sum(timings.values()))
     dataset = {
@@ -434,7 +431,7 @@ def _text(value: Any) -> str:
 
 
 def _duration(seconds: float) -> str:
-    return f"{seconds:.1f} s" if seconds < 100 else f"{int(seconds // 60)} min {seconds % 60:.0f} s"
+    return f"{seconds:.1f} s" if seconds < 100 else f"{round(seconds) // 60}:{round(seconds) % 60:02d} min"
 
 
 def _join(words: Sequence[str]) -> str:

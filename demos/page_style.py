@@ -27,7 +27,7 @@ dd{margin:0;font-size:1.5rem;font-weight:600;letter-spacing:-.02em;font-variant-
 figure{margin:0;min-width:0}
 figcaption{color:var(--soft);font-size:.9rem;margin-top:.4rem}
 .videos{display:grid;gap:1.4rem;align-items:start}
-@media(min-width:900px){.videos{grid-template-columns:repeat(auto-fit,minmax(26rem,1fr))}}
+@media(min-width:900px){.videos{grid-template-columns:minmax(0,2fr) minmax(0,3fr)}}
 video{width:100%;display:block;border-radius:10px;background:#000}
 .plots{display:grid;grid-template-columns:repeat(auto-fit,minmax(min(100%,21rem),1fr));gap:1.2rem;align-items:start}
 .plot{background:var(--card);border:1px solid var(--rule);border-radius:10px;padding:.8rem .7rem .5rem}

@@ -78,6 +78,7 @@ def run_folder(folder: Path, name: str = "kettle", target: str = "mug") -> Path:
         "position_error_m": (0.004 + 0.002 * np.sin(time_s)).tolist(),
         "rotation_error_rad": np.full(n, 0.02).tolist(),
         "tilt_rad": (tilt + 0.01).tolist(),
+        "reference_tilt_rad": tilt.tolist(),
         "poured_fraction": (0.82 * step).tolist(),
         "spilled_fraction": (0.05 * step).tolist(),
         "q_rad": q_rad.tolist(),
