@@ -23,7 +23,7 @@ border:1px solid var(--rule);border-radius:10px;overflow:hidden}
 dl div{box-shadow:0 0 0 1px var(--rule);padding:.7rem .9rem;display:flex;flex-direction:column-reverse;
 justify-content:flex-end}
 dt{color:var(--soft);font-size:.84rem}
-dd{margin:0;font-size:1.5rem;font-weight:600;letter-spacing:-.02em;font-variant-numeric:tabular-nums}
+dd{margin:0;font-size:1.4rem;font-weight:600;letter-spacing:-.03em;white-space:nowrap;font-variant-numeric:tabular-nums}
 figure{margin:0;min-width:0}
 figcaption{color:var(--soft);font-size:.9rem;margin-top:.4rem}
 .videos{display:grid;gap:1.4rem;align-items:start}
