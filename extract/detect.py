@@ -14,10 +14,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .first_pose import edge_score, edge_strength, silhouette_ious, upright_rotation
+from .first_pose import edge_score, silhouette_ious, upright_rotation
 from .geometry import Array, make_pose
 from .raster import render_depth
-from .region import TrackingMesh, extract_outline, mask_evidence, refine
+from .region import TrackingMesh, edge_strength, extract_outline, mask_evidence, refine
 from .segment import Box, Mask, mask_box, mask_from_box
 from .video import Image
 

@@ -10,11 +10,12 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from .geometry import Array, make_pose, super_fibonacci_rotations, transform_points
 from .raster import render_depth
-from .region import TrackingMesh, extract_outline, mask_evidence, refine
+from .region import TrackingMesh, edge_strength, extract_outline, mask_evidence, refine
 from .segment import Box, Mask, mask_box
 from .video import Image
 
@@ -24,7 +25,6 @@ EDGE_WEIGHT = 0.7
 BOX_WEIGHT = 0.7
 SEARCH_SIDE_PX = 72
 SEARCH_PAD = 0.25  # of the longer side, around the box
-CLEAR_EDGE = 24.0  # grey levels per px
 
 
 @dataclass(frozen=True)
@@ -133,16 +133,9 @@ def _box_iou(a: Box, b: Box) -> float:
     return shared / (a[2] * a[3] + b[2] * b[3] - shared)
 
 
-def edge_strength(rgb: Image) -> Array:
-    """(H, W, 2) image gradient, the largest of the three channels, scaled so that a clear edge has length 1."""
-    blurred = cv2.GaussianBlur(rgb, (0, 0), 1.0).astype(np.float32)
-    gradient = np.stack([cv2.Sobel(blurred, cv2.CV_32F, *order, scale=1 / 8) for order in ((1, 0), (0, 1))], axis=-1)
-    channel = np.argmax(np.linalg.norm(gradient, axis=-1), axis=-1)
-    strongest = np.take_along_axis(gradient, channel[..., None, None], axis=2)[:, :, 0]
-    return np.asarray(strongest / CLEAR_EDGE, float)
-
-
-def edge_score(mesh: TrackingMesh, T_camera_object: Array, camera_matrix: Array, strength: Array) -> float:
+def edge_score(
+    mesh: TrackingMesh, T_camera_object: Array, camera_matrix: Array, strength: NDArray[np.float32]
+) -> float:
     """Share of the outline, in [0, 1], along which the image has an edge of the same direction within 2 px."""
     outline = extract_outline(mesh, T_camera_object, camera_matrix, strength.shape[:2])
     if outline is None:

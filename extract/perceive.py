@@ -22,7 +22,7 @@ from .meshes import load_mesh, mesh_sha256
 from .overlay import OverlayItem, write_overlay
 from .progress import Progress
 from .raster import render_depth
-from .region import TrackingMesh, mask_evidence
+from .region import TrackingMesh, edge_strength, mask_evidence
 from .segment import Box, Mask, check_box, mask_box, mask_from_box, mask_from_silhouette
 from .shape_fit import View, coloured, fit_shape, tracking_mesh
 from .smoothing import smooth_poses
@@ -35,7 +35,7 @@ WORKING_SIDE_PX = 640  # tracking
 STARTING_SIDE_PX = 1280  # the first frame, where thin parts such as spouts must be seen to be fitted
 SMOOTHING_BANDWIDTH_S = 0.06
 FOUND_IOU = 0.45  # below this no pose of the mesh explains what was cut out of the first frame
-FIT_ROUNDS = 2  # of cutting the mask near the silhouette and fitting the shape to it
+FIT_ROUNDS = 3  # of cutting the mask near the silhouette and fitting the shape to it
 RECUT_BAND = 0.03  # of the object's size in the image
 
 
@@ -220,31 +220,37 @@ def _start(
     camera_matrix: Array,
 ) -> _Start:
     """Choose among the candidate meshes, then fit pose and shape to the first frame."""
-    mask = mask_from_box(rgb, box)
+    # Coarse first: at full sharpness highlights and texture tear the mask apart.
+    shrink = min(1.0, WORKING_SIDE_PX / max(rgb.shape[:2]))
+    small = np.asarray(cv2.resize(rgb, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA), np.uint8)
+    small_box, small_camera = _scaled(box, shrink), np.diag([shrink, shrink, 1.0]) @ camera_matrix
+    small_mask = mask_from_box(small, small_box)
     ranked: list[tuple[float, _Model, PoseCandidate]] = []
     for model in candidates:
         found = find_first_pose(
-            model.mesh, rgb, mask, camera_matrix, box_xywh_px=box, continuous_symmetry=model.symmetry.order == 0
-        )
+            model.mesh, small, small_mask, small_camera, box_xywh_px=small_box,
+            continuous_symmetry=model.symmetry.order == 0,
+        )  # fmt: skip
         ranked.append((found[0].merit, model, found[0]))
     _, model, pose = max(ranked, key=lambda entry: entry[0])
     T = pose.T_camera_object
     band_px = max(3, round(RECUT_BAND * max(box[2], box[3])))
     if pose.iou < FOUND_IOU:
         raise _not_found(request, info, f"the best silhouette covers only {pose.iou:.0%} of what was found")
-    evidence = _evidence(model.mesh, rgb, T, camera_matrix, mask, band_px)
+    evidence = _evidence(model.mesh, rgb, T, camera_matrix, _resized(small_mask, rgb), band_px)
+    edges = edge_strength(rgb)
     for _ in range(FIT_ROUNDS if model.vessel is not None else 0):
         assert model.vessel is not None
-        view = View(*mask_evidence(evidence), T, box if source == "given" else None)
+        view = View(*mask_evidence(evidence), T, box if source == "given" else None, edges)
         vessel, (T_fitted,) = fit_shape(model.vessel, [view], camera_matrix)
         fitted = _vessel_model(vessel)
         before = judge(model.mesh, T, camera_matrix, rgb, evidence, box, pose.upright)
         after = judge(fitted.mesh, T_fitted, camera_matrix, rgb, evidence, box, pose.upright)
-        if after.merit <= before.merit:
+        if after.merit <= before.merit + 0.002:
             break  # a mask that lost a thin part misled the fit: edges and box tell
         model, T, pose = fitted, T_fitted, after
         evidence = _evidence(model.mesh, rgb, T, camera_matrix, evidence, band_px)
-    silhouette = _silhouette(model.mesh, T, camera_matrix, mask.shape)
+    silhouette = _silhouette(model.mesh, T, camera_matrix, rgb.shape)
     mask = _evidence(model.mesh, rgb, T, camera_matrix, evidence, band_px) & silhouette
     if model.vessel is not None:
         model = _vessel_model(coloured(model.vessel, rgb, mask))

@@ -25,6 +25,10 @@ HALF_LINE = 10  # samples on either side of the outline
 BITS = 4  # colour resolution per channel of the local histograms
 BINS = 1 << (3 * BITS)
 LOCAL_CENTRES = 48
+CLEAR_EDGE = 24.0  # grey levels per px
+NO_EDGES = np.zeros((0, 0, 2), np.float32)
+# An outline on a clear image edge is this much likelier than one on none; steps beyond 2 px would miss edges.
+EDGE_WEIGHT, EDGE_FLOOR, EDGE_STEP_PX = 1.0, 0.2, 2.0
 AMPLITUDE, SLOPE = 0.40, 1.0  # of the smooth step between inside and outside (SRT3D, eq. 13)
 
 
@@ -103,6 +107,15 @@ class ColourModel:
             self.foreground[k] = (1 - a) * self.foreground[k] + a * f
             self.background[k] = (1 - a) * self.background[k] + a * b
             self.seen[k] = 1.0
+
+
+def edge_strength(rgb: Image) -> NDArray[np.float32]:
+    """(H, W, 2) image gradient, the largest of the three channels, scaled so that a clear edge has length 1."""
+    blurred = cv2.GaussianBlur(rgb, (0, 0), 1.0).astype(np.float32)
+    gradient = np.stack([cv2.Sobel(blurred, cv2.CV_32F, *order, scale=1 / 8) for order in ((1, 0), (0, 1))], axis=-1)
+    channel = np.argmax(np.linalg.norm(gradient, axis=-1), axis=-1)
+    strongest = np.take_along_axis(gradient, channel[..., None, None], axis=2)[:, :, 0]
+    return np.asarray(strongest / CLEAR_EDGE, np.float32)
 
 
 def mask_evidence(mask: NDArray[np.bool_]) -> tuple[NDArray[np.int32], ColourModel]:
@@ -198,6 +211,7 @@ def measure(
     bins: NDArray[np.int32],
     colours: ColourModel,
     step_px: float,
+    edges: NDArray[np.float32] | None = None,
 ) -> Lines | None:
     """Read every line of the outline at one pose; None when fewer than 12 are usable."""
     outline = extract_outline(mesh, T_camera_object, camera_matrix, (bins.shape[0], bins.shape[1]))
@@ -207,7 +221,8 @@ def measure(
     mean_px, variance, gain = np.zeros(len(outline)), np.zeros(len(outline)), np.zeros(len(outline))
     _measure_lines(
         outline.pixel, outline.normal, outline.inside_px, outline.outside_px, nearest, bins,
-        colours.foreground, colours.background, colours.seen, step_px, mean_px, variance, gain,
+        colours.foreground, colours.background, colours.seen, NO_EDGES if edges is None else edges,
+        step_px, mean_px, variance, gain,
     )  # fmt: skip
     usable = variance > 0
     if usable.sum() < 12:
@@ -239,12 +254,14 @@ def refine(
     prior_rotation_rad: float = 0.15,
     prior_translation: float = 0.02,
     prior_depth: float = 0.01,
+    edges: NDArray[np.float32] | None = None,
 ) -> Refinement:
     """Refine a pose against one image.
 
     bins: (H, W) from `colour_bins`.  steps_px: sample spacing along the lines for each outer pass, coarse to fine.
     prior_*: standard deviation of the start pose, rotation in rad, translation as a fraction of the distance,
     sideways and along the viewing ray: directions the outline does not show stay where they were.
+    edges: (H, W, 2) from `edge_strength`, to weigh image edges in with the colours; None for colours alone.
     """
     T_start: Array = T_camera_object.copy()
     T: Array = T_camera_object.copy()
@@ -257,7 +274,7 @@ def refine(
     prior[:3, :3] = np.eye(3) / prior_rotation_rad**2
     prior[3:, 3:] = weight_t
     for step_px in steps_px:
-        lines = measure(mesh, T, camera_matrix, bins, colours, step_px)
+        lines = measure(mesh, T, camera_matrix, bins, colours, step_px, edges)
         if lines is None:
             break
         score, count = float(np.mean(lines.gain)), len(lines.gain)
@@ -374,7 +391,7 @@ def _collect_lines(
 def _measure_lines(
     pixel: Array, normal: Array, inside: NDArray[np.float32], outside: NDArray[np.float32],
     nearest: NDArray[np.int32], bins: NDArray[np.int32],
-    hist_f: NDArray[np.float32], hist_b: NDArray[np.float32], seen: NDArray[np.float32],
+    hist_f: NDArray[np.float32], hist_b: NDArray[np.float32], seen: NDArray[np.float32], edges: NDArray[np.float32],
     step_px: float, mean_px: Array, variance: Array, gain: Array,
 ) -> None:  # fmt: skip
     """Posterior mean and variance (px) of the outline's position on every line; variance 0 marks an unusable line."""
@@ -383,6 +400,7 @@ def _measure_lines(
     n = 2 * HALF_LINE + 1
     p_f = np.empty(n)
     log_p = np.empty(n)
+    use_edges = edges.shape[0] > 0 and step_px <= EDGE_STEP_PX
     for i in range(pixel.shape[0]):
         variance[i] = 0.0
         # Thin parts (spouts, handles) are only measured at steps fine enough to see both of their sides.
@@ -413,6 +431,13 @@ def _measure_lines(
             for j in range(n):
                 inside_share = 0.5 - AMPLITUDE * np.tanh((j - d) / (2.0 * SLOPE))
                 total += np.log(inside_share * p_f[j] + (1.0 - inside_share) * (1.0 - p_f[j]))
+            if use_edges:
+                r = (d - HALF_LINE) * step_px
+                x = round(pixel[i, 0] + r * normal[i, 0])
+                y = round(pixel[i, 1] + r * normal[i, 1])
+                if 0 <= x < w and 0 <= y < h:
+                    along = abs(edges[y, x, 0] * normal[i, 0] + edges[y, x, 1] * normal[i, 1])
+                    total += EDGE_WEIGHT * np.log(EDGE_FLOOR + min(along, 1.0))
             log_p[d] = total
             top = max(top, total)
         weight = 0.0

@@ -10,6 +10,8 @@ from scipy.ndimage import gaussian_filter
 from .errors import UserError
 from .video import Image
 
+CLOSING = 0.02  # of the box: gaps that highlights cut into shiny objects
+
 Mask = NDArray[np.bool_]
 Box = tuple[float, float, float, float]  # x, y, width, height in px
 
@@ -38,7 +40,7 @@ def mask_from_box(rgb: Image, box_xywh_px: Box, iterations: int = 5) -> Mask:
     inner = labels[y : y + h, x : x + w]
     inner[:] = np.where(_rare_outside(rgb, (x, y, w, h)), cv2.GC_PR_FGD, cv2.GC_PR_BGD)
     mask = _grabcut(rgb, labels, (x, y, w, h), iterations)
-    mask = _largest_part(mask)
+    mask = _largest_part(_closed(mask, max(1, round(CLOSING * max(w, h)))))
     if mask.sum() < 0.05 * w * h:
         ellipse = np.zeros((height, width), np.uint8)
         cv2.ellipse(ellipse, (x + w // 2, y + h // 2), (w // 2, h // 2), 0, 0, 360, 1, -1)
@@ -90,6 +92,13 @@ def _rare_outside(rgb: Image, box: tuple[int, int, int, int]) -> Mask:
     share = histograms[0] / (histograms[0] + histograms[1] + 1e-9)
     cell = tuple((lab[inside].reshape(h, w, 3) * (24 / 256)).astype(int).transpose(2, 0, 1))
     return np.asarray(share[cell] > 0.6)
+
+
+def _closed(mask: Mask, radius_px: int) -> Mask:
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius_px + 1, 2 * radius_px + 1))
+    padded = np.pad(mask.astype(np.uint8), radius_px)
+    closed = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, kernel)
+    return np.asarray(closed[radius_px:-radius_px, radius_px:-radius_px] > 0)
 
 
 def _largest_part(mask: Mask) -> Mask:

@@ -23,7 +23,7 @@ from .vessels import Vessel, make_vessel, parameter_space
 
 FIXED = ("wall_m", "red", "green", "blue")  # not seen in a silhouette
 PRIOR_SHARE = 0.15  # standard deviation of a shape parameter around its start, as a share of its range
-TRACKING_FACES = 4000
+TRACKING_FACES = 8000
 BOX_STD_PX = 4.0  # how exactly people draw boxes
 
 
@@ -32,13 +32,14 @@ class View:
     """One frame that the shape must explain.
 
     bins: (H, W) colour bins.  colours: the colours learned there.  T_camera_object: the pose so far.
-    box_xywh_px: box around the whole object, if a person gave one.
+    box_xywh_px: box around the whole object, if a person gave one.  edges: (H, W, 2) from `edge_strength`.
     """
 
     bins: NDArray[np.int32]
     colours: ColourModel
     T_camera_object: Array
     box_xywh_px: Box | None = None
+    edges: NDArray[np.float32] | None = None
 
 
 def tracking_mesh(vessel: Vessel, faces: int = TRACKING_FACES) -> TrackingMesh:
@@ -69,7 +70,7 @@ def fit_shape(
     for step_px in steps_px:
         mesh = tracking_mesh(vessel)
         measured = [
-            measure(mesh, T, camera_matrix, view.bins, view.colours, step_px)
+            measure(mesh, T, camera_matrix, view.bins, view.colours, step_px, view.edges)
             for T, view in zip(poses, views, strict=True)
         ]
         used = [k for k, lines in enumerate(measured) if lines is not None]

@@ -6,17 +6,19 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from .first_pose import edge_score, edge_strength
+from .first_pose import edge_score
 from .geometry import Array
 from .raster import render_depth
-from .region import ColourModel, TrackingMesh, colour_bins, extract_outline, measure, refine
+from .region import ColourModel, TrackingMesh, colour_bins, edge_strength, extract_outline, measure, refine
 from .segment import Mask
 from .video import Image
 
 LEARNING_RATE = 0.15
 LEARN_ABOVE = 0.35  # a frame the tracker is unsure of teaches it nothing
+TRACK_EDGES = True
 LOST_BELOW = 0.2
 VELOCITY_KEPT = 0.7  # hands accelerate: half-trusting the last velocity beats trusting it or ignoring it
 SEARCH_STEPS_PX = (9.0, 7.0, 5.0, 3.0, 2.0, 1.0)
@@ -79,14 +81,15 @@ class ObjectTracker:
     def _refined(
         self,
         start: Array,
-        bins: np.ndarray[tuple[int, ...], np.dtype[np.int32]],
-        strength: Array,
+        bins: NDArray[np.int32],
+        strength: NDArray[np.float32],
         steps_px: tuple[float, ...] = (5.0, 3.0, 2.0, 1.0, 1.0),
         freedom: float = 1.0,
     ) -> Estimate:
         result = refine(
             self.mesh, start, self.camera_matrix, bins, self.colours, steps_px=steps_px,
             prior_rotation_rad=0.15 * freedom, prior_translation=0.02 * freedom, prior_depth=0.01 * freedom,
+            edges=strength if TRACK_EDGES else None,
         )  # fmt: skip
         T = result.T_camera_object
         height, width = bins.shape
@@ -95,7 +98,7 @@ class ObjectTracker:
             return Estimate(T, 0.0, False)
         return Estimate(T, self._confidence(T, bins, strength) * min(1.0, 2 * in_view), True)
 
-    def _confidence(self, T: Array, bins: np.ndarray[tuple[int, ...], np.dtype[np.int32]], strength: Array) -> float:
+    def _confidence(self, T: Array, bins: NDArray[np.int32], strength: NDArray[np.float32]) -> float:
         """Mean of two shares: lines whose colours put the outline within 2 px of it, and outline on image edges."""
         lines = measure(self.mesh, T, self.camera_matrix, bins, self.colours, 1.0)
         if lines is None:

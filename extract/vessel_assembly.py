@@ -180,37 +180,49 @@ def spout(
     tip_radius_m: float,
     wall_m: float,
     rgba: Color,
-    *,
-    root_aspect: float = 1.0,
 ) -> tuple[Part, Part, Outlet]:
     """Hollow tapered tube from inside the body along `path` (K, 2) of (x, z) to its mouth: tube, channel, outlet.
 
-    The first point of the path only says at which height the spout leaves the body, horizontally at first.
-    root_aspect: width across the symmetry plane over width within it at the root; the mouth is round.
+    The path begins well inside the body; the tube begins where its round end last fits into the cavity, which then
+    cuts it flush with the inner wall.
     """
-    z_root = float(path[0, 1])
-    channel_root = root_radius_m - wall_m
-    span = np.linspace(z_root - root_radius_m, z_root + root_radius_m, 9)
-    half_y = root_radius_m * root_aspect
-    chord = [math.sqrt(max(walls.inner_radius(z) ** 2 - half_y**2, 0.0)) for z in span]
-    path = np.vstack([[min(chord) - 0.0015, z_root], path[path[:, 0] > min(chord) - 0.0005]])
+    path, entry = _from_inside(walls, path, root_radius_m)
     share = cumulative_share(path)
     outer_m = root_radius_m + (tip_radius_m - root_radius_m) * share
-    outer_y_m = outer_m * (1 + (root_aspect - 1) * (1 - share))
-    solid = tube(path, outer_m, outer_y_m)
+    solid = tube(path, outer_m)
     direction = path[-1] - path[-2]
     direction = direction / np.linalg.norm(direction)
     longer = np.vstack([path, path[-1] + direction * OVERCUT_M])
-    channel = tube(longer, np.append(outer_m, tip_radius_m) - wall_m, np.append(outer_y_m, tip_radius_m) - wall_m)
+    channel = tube(longer, np.append(outer_m, tip_radius_m) - wall_m)
     outlet = Outlet(
         "spout",
         np.array([path[-1, 0], 0.0, path[-1, 1]]),
         np.array([direction[0], 0.0, direction[1]]),
-        np.array([walls.inner_radius(z_root), 0.0, z_root]),
-        channel_root,
+        np.array([entry[0], 0.0, entry[1]]),
+        root_radius_m - wall_m,
         tip_radius_m - wall_m,
     )
     return Part(solid, rgba), Part(channel, rgba), outlet
+
+
+def _from_inside(walls: Walls, path: Array, half_m: float) -> tuple[Array, Array]:
+    """The path (K, 2) from where a tube of radius half_m leaves the cavity; and where its middle crosses the wall."""
+    fine = resampled(path, 0.0005)
+    tangent = np.gradient(fine, axis=0)
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    turn = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    x = fine[:, :1] - half_m * np.cos(turn) * tangent[:, 1:]
+    z = fine[:, 1:] + half_m * np.cos(turn) * tangent[:, :1]
+    inner_z, inner_r = walls.inner.T
+    room = np.interp(z, inner_z, inner_r) - np.hypot(x, half_m * np.sin(turn))
+    inside = ((room > 2e-4) & (z > inner_z[0] + 2e-4) & (z < inner_z[-1] - 2e-4)).all(axis=1)
+    if not inside[0]:
+        raise ValueError(f"a spout of radius {half_m} m does not fit into the body")
+    leaves = len(inside) if inside.all() else int(np.argmin(inside))
+    middle_out = np.abs(fine[:, 0]) > np.interp(fine[:, 1], inner_z, inner_r)
+    start = max(leaves - 3, 0)
+    rest = path[cumulative_share(path) > cumulative_share(fine)[min(leaves, len(fine) - 1)]]
+    return np.vstack([fine[start], rest]), np.asarray(fine[int(np.argmax(middle_out))])
 
 
 def loop_handle(
@@ -251,7 +263,9 @@ def handle_grasp(grip: Array, width_m: float) -> GraspRegion:
         axis = -axis
     # Across the stick, toward the body.
     approach = np.array([axis[1], 0.0, -axis[0]])
-    center = 0.5 * (grip[0] + grip[-1])
+    # On the stick itself, which may bow away from the chord.
+    share = cumulative_share(grip)
+    center = np.array([np.interp(0.5, share, grip[:, 0]), np.interp(0.5, share, grip[:, 1])])
     return GraspRegion(
         "handle",
         np.array([center[0], 0.0, center[1]]),

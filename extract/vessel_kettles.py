@@ -179,11 +179,13 @@ def stovetop_kettle(p: Params, rgba: Color) -> Draft:
     z0 = p["spout_height"] * h
     wall_x = walls.outer_radius(z0)
     tilt, length = p["spout_tilt_rad"], p["spout_length_m"]
+    along = np.array([np.cos(tilt), np.sin(tilt)])
+    corner = np.array([wall_x, z0])
+    # Straight through the wall; inside it stops where the body is wide enough for it.
+    inside = corner - along * min(3.0 * root, (z0 - walls.floor_m - 1.1 * root) / along[1])
+    tip = corner + length * along
     step = 0.25 * root
-    corner = np.array([wall_x - 0.3 * root, z0])
-    tip = corner + length * np.array([np.cos(tilt), np.sin(tilt)])
-    mouth = tip + np.array([step, 0.35 * step])
-    path = rounded_path(np.array([[0.0, z0], corner, tip, mouth]), [1.5 * root, step], steps=6)
+    path = rounded_path(np.array([inside, tip, tip + np.array([step, 0.35 * step])]), step, steps=6)
     tube_part, channel, outlet = spout(walls, path, root, p["spout_taper"] * root, max(p["wall_m"], 0.001), rgba)
 
     grip_r = p["handle_radius_m"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -128,6 +129,8 @@ def render_vessel(
     vessel: Vessel, size_px: int = 240, *, elevation_deg: float = 22.0, azimuth_deg: float = 115.0
 ) -> np.ndarray[Any, np.dtype[np.uint8]]:
     """(size_px, size_px, 3) picture of a vessel by MuJoCo's renderer, framed to fill it."""
+    # Read when MuJoCo is first imported; EGL needs no display.
+    os.environ.setdefault("MUJOCO_GL", "egl")
     import mujoco
 
     spec = mujoco.MjSpec()
@@ -142,6 +145,7 @@ def render_vessel(
         type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
         builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT,
         rgb1=[0.96, 0.96, 0.95],
+        rgb2=[0.96, 0.96, 0.95],
         width=16,
         height=96,
     )
