@@ -7,6 +7,7 @@ midway between the finger pads: z along the approach direction, y along which th
 
 from __future__ import annotations
 
+import importlib.metadata
 import importlib.util
 import os
 from functools import cache
@@ -102,13 +103,18 @@ def _add_servo(spec: mujoco.MjSpec, joint: str, stiffness: float, damping: float
 
 
 def _description_folder() -> Path:
-    # `example_robot_data` itself imports pinocchio; only its place is wanted.
-    found = importlib.util.find_spec("example_robot_data")
-    if found is not None and found.origin is not None:
-        for parent in Path(found.origin).parents:
-            folder = parent / "share" / "example-robot-data" / "robots" / "panda_description"
-            if folder.is_dir():
-                return folder
+    # The data are a distribution of their own; the module `example_robot_data` is another one, which imports pinocchio,
+    # so that only its place is of use, where a package manager other than pip brought both.
+    roots = []
+    try:
+        roots.append(Path(str(importlib.metadata.distribution("example-robot-data").locate_file("cmeel.prefix"))))
+    except importlib.metadata.PackageNotFoundError:
+        found = importlib.util.find_spec("example_robot_data")
+        roots += Path(found.origin).parents if found is not None and found.origin is not None else []
+    for root in roots:
+        folder = root / "share" / "example-robot-data" / "robots" / "panda_description"
+        if folder.is_dir():
+            return folder
     raise UserError("the Panda's description is missing; install it with `pip install 'example-robot-data>=5,<6'`")
 
 
