@@ -47,7 +47,7 @@ def feasibility(reference: Reference, joints: JointTrajectory) -> dict[str, Any]
         "scale": reference.scale,
         "time_stretch": float(reference.header.get("time_stretch", 1.0)),
         "payload_kg": float(joints.header.get("payload_kg", 0.0)),
-        "caught_part_of_pouring_time": reference.header.get("feasibility", {}).get("caught_part_of_pouring_time"),
+        "caught_part_of_jet": reference.header.get("feasibility", {}).get("caught_part_of_jet"),
         "changes": reference.notes,
     }
     problems = _problems(findings, margin, speed_part, torque_part)

@@ -16,17 +16,10 @@ from ..extract.errors import UserError
 from ..extract.geometry import Array, angle_between_rad, invert_pose, make_pose
 from ..extract.track import ObjectTrack
 from .grasps import MAX_WIDTH_M
+from .jet import filling_m3, jet_of, tilt_rad
 from .panda import DQ_MAX_RAD_S
 from .placement_search import Placement, Shortfall, Stage, search_placement
-from .receptacle import (
-    bottom_m,
-    jet_landing_m,
-    place_receptacle,
-    pouring_knots,
-    receptacle_pose_at_pour,
-    surface_points,
-    tilt_rad,
-)
+from .receptacle import bottom_m, place_receptacle, receptacle_pose_at_pour, surface_points
 from .reference import Reference, vessel_from_header, vessel_to_header
 from .resampling import ResampledTrack, resample_track
 
@@ -39,6 +32,8 @@ DEFAULT_RECEPTACLE = "bowl"
 SPEED_PART = 0.8
 _STILL_RAD, _STILL_S = np.deg2rad(5.0), 0.8
 _SAME_TABLE_M = 0.08
+# The receptacle is taken from where it was while the tilt was above this part of its greatest value.
+_POURING_PART = 0.8
 
 
 @dataclass(frozen=True)
@@ -138,7 +133,7 @@ def build_reference(
                 {"first": c.first, "second": c.second, "time_s": float(stage.time_s[c.knot]), "depth_m": c.depth_m}
                 for c in placement.collisions
             ],
-            "caught_part_of_pouring_time": caught,
+            "caught_part_of_jet": caught,
         },
     }
     reference = Reference.from_poses(T_world_object, stage.time_s, header, resampled.confidence, resampled.video_time_s)
@@ -185,7 +180,8 @@ def _upright(
         notes.append("The vessel looks the same from all sides: its unseen spin about its own axis was left out.")
     T_receptacle = None
     if receptacle_track is not None:
-        pouring_s = resampled.video_time_s[pouring_knots(T_object)]
+        tilt = tilt_rad(T_object)
+        pouring_s = resampled.video_time_s[tilt >= _POURING_PART * tilt.max()]
         T_receptacle = up_camera @ receptacle_pose_at_pour(receptacle_track, pouring_s)
     deepest = int(np.argmax(tilt_rad(T_object)))
     return _Seen(T_object, R_up_camera, T_receptacle, T_object[deepest, :3, 3])
@@ -248,7 +244,7 @@ def _make_stage(
     tracked = seen.T_receptacle
     base_m = 0.0
     if tracked is not None:
-        tracked = _along_ray(tracked, T, vessel, receptacle, seen)
+        tracked = _along_ray(tracked, T, vessel, receptacle, control_hz)
         # Heights mean something only once the receptacle is at the depth of the jet.
         held_high_m = seen_start_m - (float(tracked[2, 3]) - bottom_m(receptacle))
         base_m = held_high_m if held_high_m > _SAME_TABLE_M else 0.0
@@ -258,7 +254,7 @@ def _make_stage(
     T[:, 2, 3] += rise
     if tracked is not None:
         tracked = make_pose(tracked[:3, :3], tracked[:3, 3] + [0.0, 0.0, rise])
-    placed = place_receptacle(T, vessel, receptacle, tracked, seen.ray)
+    placed = place_receptacle(T, vessel, receptacle, tracked, seen.ray, control_hz)
     T[:, 2, 3] += placed.lift_m
     start_m = float(_lowest_m(T[:1], vessel)[0])
     if start_m > 0.005:
@@ -279,14 +275,15 @@ def _make_stage(
     return Stage(T, time_s, vessel, receptacle, placed.T_receptacle), notes, placed.caught
 
 
-def _along_ray(tracked: Array, T: Array, vessel: Vessel, receptacle: Vessel, seen: _Seen) -> Array:
+def _along_ray(tracked: Array, T: Array, vessel: Vessel, receptacle: Vessel, control_hz: float) -> Array:
     """The receptacle slid along its own line of sight to the depth at which it is nearest to the jet."""
-    landing = jet_landing_m(T, vessel, float(tracked[2, 3]) + bottom_m(receptacle))[int(np.argmax(tilt_rad(T)))]
+    jet = jet_of(T, vessel, filling_m3(vessel, receptacle), control_hz)
+    landing = jet.share @ jet.landing_m(float(tracked[2, 3]) + bottom_m(receptacle))
     position = tracked[:3, 3]
     flat = position[:2]
-    factor = float(landing @ flat / max(flat @ flat, 1e-9))
+    factor = float(landing @ flat) / max(float(flat @ flat), 1e-9)
     # Far outside this range the track is wrong, not just its depth.
-    return make_pose(tracked[:3, :3], position * np.clip(factor, 0.5, 2.0))
+    return make_pose(tracked[:3, :3], position * float(np.clip(factor, 0.5, 2.0)))
 
 
 def _lowest_m(T: Array, vessel: Vessel) -> Array:

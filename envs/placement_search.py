@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from ..extract.geometry import Array, rotation_angle_rad
 from .collision import Collision, CollisionChecker
 from .grasps import Grasp, grasp_candidates
+from .jet import tilt_rad
 from .kinematics import arm_seeds, limit_margin_rad, manipulability, solve_ik
 from .panda import DQ_MAX_RAD_S, Q_HOME_RAD, Q_MAX_RAD, Q_MIN_RAD
-from .receptacle import tilt_rad
 
 if TYPE_CHECKING:
     from ..extract.vessels import Vessel

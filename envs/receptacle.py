@@ -7,55 +7,29 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from ..extract.geometry import Array, angle_between_rad, make_pose
+from ..extract.geometry import Array, make_pose
 from ..extract.track import ObjectTrack
+from .jet import filling_m3, jet_of, tilt_rad
 
 if TYPE_CHECKING:
     from ..extract.vessels import Vessel
 
-GRAVITY_M_S2 = 9.81
-# Grains roll out of a tilted vessel at about this speed; a jet as slow as this falls nearly straight.
-JET_SPEED_M_S = 0.3
 CLEARANCE_M = 0.01
-# The liquid leaves while the tilt is above this part of its greatest value.
-POURING_PART = 0.8
-_UP = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True)
 class ReceptaclePlacement:
     """T_receptacle: (4, 4) upright on the table. lift_m: how far the whole vessel motion must rise to clear the rim.
 
-    caught: part of the pouring time in which the jet lands in the mouth. notes: plain sentences.
+    caught: part of the jet that should land in the mouth. notes: plain sentences.
     """
 
     T_receptacle: Array
     lift_m: float
     caught: float
     notes: list[str]
-
-
-def tilt_rad(T: Array) -> Array:
-    """(N,) angle of the object's +z axis to the vertical."""
-    return angle_between_rad(T[..., :3, 2], _UP)
-
-
-def pouring_knots(T: Array) -> NDArray[np.int64]:
-    """Indices of the knots at which the vessel is tilted enough to pour."""
-    tilt = tilt_rad(T)
-    return np.flatnonzero(tilt >= POURING_PART * tilt.max()).astype(np.int64)
-
-
-def jet_landing_m(T: Array, vessel: Vessel, height_m: float, speed_m_s: float = JET_SPEED_M_S) -> Array:
-    """(N, 2) where liquid that leaves the outlet in poses T (N, 4, 4) falls through the plane z = `height_m`."""
-    start = T[:, :3, :3] @ vessel.outlet.point_m + T[:, :3, 3]
-    velocity = speed_m_s * (T[:, :3, :3] @ vessel.outlet.direction)
-    drop = np.maximum(start[:, 2] - height_m, 0.0)
-    fall_s = (velocity[:, 2] + np.sqrt(velocity[:, 2] ** 2 + 2 * GRAVITY_M_S2 * drop)) / GRAVITY_M_S2
-    return np.asarray(start[:, :2] + velocity[:, :2] * fall_s[:, None])
 
 
 def mouth_radius_m(receptacle: Vessel) -> float:
@@ -78,7 +52,7 @@ def surface_points(vessel: Vessel, count: int = 1500) -> Array:
 
 
 def place_receptacle(
-    T: Array, vessel: Vessel, receptacle: Vessel, tracked: Array | None, ray: Array | None
+    T: Array, vessel: Vessel, receptacle: Vessel, tracked: Array | None, ray: Array | None, control_hz: float
 ) -> ReceptaclePlacement:
     """Stand the receptacle on z = 0 under the jet.
 
@@ -87,36 +61,31 @@ def place_receptacle(
     camera's line of sight) is told apart from the rest.
     """
     notes: list[str] = []
-    pouring = pouring_knots(T)
     rim_m = float(receptacle.extents_m[2])
     mouth = mouth_radius_m(receptacle)
     outer = float(receptacle.exterior.radius_m.max()) * max(1.0, receptacle.exterior.aspect) + 0.005
-    points = surface_points(vessel)
-    yaw_rad = _facing_yaw_rad(T, tracked)
-    low_xyz = _low_points(T, points, rim_m)
+    jet = jet_of(T, vessel, filling_m3(vessel, receptacle), control_hz)
+    low_xyz = _low_points(T, surface_points(vessel), rim_m)
     lift_m, caught = 0.0, 0.0
     centre: Array = np.zeros(2)
-    # The landing point depends on the height of fall, the height on where the receptacle stands: two rounds settle it.
+    # The landing point depends on the height of fall, that on where the receptacle stands: three rounds settle it.
     for _ in range(3):
-        raised = T.copy()
-        raised[:, 2, 3] += lift_m
-        landing = jet_landing_m(raised, vessel, rim_m)
-        deepest = int(np.argmax(tilt_rad(T)))
-        centre = _best_centre(landing[pouring], landing[deepest], mouth, low_xyz, outer)
+        landing = jet.landing_m(rim_m - lift_m)
+        centre = _best_centre(landing, jet.share, mouth, low_xyz, outer)
         if tracked is not None:
-            centre = _least_move(tracked[:2, 3], centre, landing[pouring], landing[deepest], mouth)
-        caught = float(np.mean(np.linalg.norm(landing[pouring] - centre, axis=1) <= 0.9 * mouth))
+            centre = _least_move(tracked[:2, 3], centre, landing, jet.share, mouth)
+        caught = float(jet.share @ (np.linalg.norm(landing - centre, axis=1) <= 0.9 * mouth))
         needed = float(_needed_lift_m(low_xyz, centre[None], outer)[0])
         if abs(needed - lift_m) < 1e-4:
             break
         lift_m = needed
+    yaw_rad = _facing_yaw_rad(T, tracked)
     T_receptacle = make_pose(_yaw_matrix(yaw_rad), (float(centre[0]), float(centre[1]), bottom_m(receptacle)))
     if tracked is not None:
         notes.append(_shift_sentence(centre - tracked[:2, 3], ray))
     if caught < 0.7:
         notes.append(
-            f"The outlet wanders while pouring: the receptacle can stay under it for "
-            f"{100 * caught:.0f}% of that time only."
+            f"The jet wanders while pouring: the receptacle can catch about {100 * caught:.0f}% of it where it stands."
         )
     return ReceptaclePlacement(T_receptacle, lift_m, caught, notes)
 
@@ -135,32 +104,31 @@ def receptacle_pose_at_pour(track: ObjectTrack, video_time_s: Array) -> Array:
     return make_pose(Rotation.from_matrix(T[:, :3, :3]).mean().as_matrix(), median)
 
 
-def _best_centre(landing: Array, deepest: Array, mouth_m: float, low_xyz: Array, outer_m: float) -> Array:
-    """The place (2,) that catches most: tightly first, then at all; without making the vessel rise; near the jet."""
+def _best_centre(landing: Array, share: Array, mouth_m: float, low_xyz: Array, outer_m: float) -> Array:
+    """The place (2,) that catches most: tightly first, then at all; without making the vessel rise; near the middle."""
+    flowing = landing[share > 1e-4]
+    middle = share @ landing
     angle = np.arange(12) * np.pi / 6
-    ring = np.concatenate([part * np.column_stack([np.cos(angle), np.sin(angle)]) for part in (0.3, 0.6)]) * mouth_m
-    spread = landing[:: max(1, len(landing) // 30)]
-    candidates = np.vstack([deepest, landing.mean(axis=0), spread, deepest + ring, landing.mean(axis=0) + ring])
+    ring = np.concatenate([part * np.column_stack([np.cos(angle), np.sin(angle)]) for part in (0.15, 0.3, 0.6)])
+    candidates = np.vstack([middle, flowing[:: max(1, len(flowing) // 40)], middle + mouth_m * ring])
     away = np.linalg.norm(landing[None] - candidates[:, None], axis=2)
-    tight, wide = (np.mean(away <= part * mouth_m, axis=1) for part in (0.5, 0.9))
-    worth = tight + wide - 0.1 * np.linalg.norm(candidates - deepest, axis=1) / mouth_m
+    tight, wide = ((away <= part * mouth_m) @ share for part in (0.5, 0.9))
+    worth = tight + wide - 0.3 * np.linalg.norm(candidates - middle, axis=1) / mouth_m
     # Half of what is caught tightly is given up for a vessel that stands on the table rather than 10 cm above it.
     worth -= 5.0 * np.minimum(_needed_lift_m(low_xyz, candidates, outer_m), 0.2)
     return np.asarray(candidates[np.argmax(worth)])
 
 
-def _least_move(seen: Array, best: Array, landing: Array, deepest: Array, mouth_m: float) -> Array:
-    """The point nearest to `seen` on the way to `best` that catches as well as `best` does, with a margin."""
+def _least_move(seen: Array, best: Array, landing: Array, share: Array, mouth_m: float) -> Array:
+    """The point nearest to `seen` on the way to `best` that catches nearly as well as `best` does, with a margin."""
 
-    def quality(centre: Array) -> tuple[float, bool]:
-        away = np.linalg.norm(landing - centre, axis=1)
-        return float(np.mean(away <= 0.6 * mouth_m)), bool(np.linalg.norm(deepest - centre) <= 0.6 * mouth_m)
+    def quality(centre: Array) -> float:
+        return float(share @ (np.linalg.norm(landing - centre, axis=1) <= 0.6 * mouth_m))
 
-    goal, goal_hit = quality(best)
+    goal = quality(best) - 0.02
     for part in np.linspace(0.0, 1.0, 101):
         centre = seen + part * (best - seen)
-        caught, hit = quality(centre)
-        if caught >= goal - 0.02 and (hit or not goal_hit):
+        if quality(centre) >= goal:
             return np.asarray(centre)
     return best
 
