@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import ast
+import importlib.metadata
+import re
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -129,6 +132,18 @@ def imported_names(node: ast.Import | ast.ImportFrom) -> list[str]:
     return [node.module or ""] if node.level == 0 else []
 
 
+def outside_imports(root: Path) -> dict[str, set[str]]:
+    """Top-level names of other distributions -> modules that import them, lazily or not."""
+    found: dict[str, set[str]] = {}
+    for name, path in module_files(root).items():
+        for node in imports_of(ast.parse(path.read_text(encoding="utf-8")), at_load=False):
+            for imported in imported_names(node):
+                top = imported.split(".")[0]
+                if top and top not in sys.stdlib_module_names:
+                    found.setdefault(top, set()).add(name)
+    return found
+
+
 CHECKS = (back_edges, circles, absolute_imports, heavy_imports)
 
 
@@ -136,6 +151,25 @@ CHECKS = (back_edges, circles, absolute_imports, heavy_imports)
 def test_imports_run_one_way(check: object) -> None:
     assert callable(check)
     assert check(ROOT) == []
+
+
+def test_everything_imported_is_a_requirement() -> None:
+    """What is only there because another package brought it goes away without warning. lerobot brings what it names."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+
+    def names(requirements: list[str]) -> set[str]:
+        return {re.split(r"[\[<>=!~; ]", r)[0].lower().replace("_", "-") for r in requirements}
+
+    extras = project["optional-dependencies"]
+    base, dev = names(project["dependencies"]), names(extras["dev"])
+    brought = {"torch", "torchvision", "pandas", "pyarrow", "datasets", "huggingface-hub"}
+    above = names([r for extra, rs in extras.items() if extra != "dev" for r in rs]) | brought
+    distributions = importlib.metadata.packages_distributions()
+    for top, modules in outside_imports(ROOT).items():
+        sources = {d.lower().replace("_", "-") for d in distributions.get(top, [top])}
+        allowed = base if any(level(module) < 2 for module in modules) else base | above
+        assert sources & allowed, f"{top} is imported by {', '.join(sorted(modules))} but is no requirement"
+        assert not sources & dev, f"{top} is for development only"
 
 
 def test_no_module_at_the_root_but_the_three_that_ship() -> None:
