@@ -19,10 +19,11 @@ from numpy.typing import NDArray
 from .errors import UserError
 from .files import write_json
 from .geometry import Array, invert_pose
+from .offscreen import load_mujoco
 from .progress import Progress
 from .synthetic_hand import Grip, grips
 from .synthetic_motion import Camera, PourPath, PourShape, place_camera, plan_pour
-from .synthetic_scene import OBJECT, RECEPTACLE, Scene, load_mujoco
+from .synthetic_scene import OBJECT, RECEPTACLE, Scene
 from .track import ObjectTrack
 from .vessel_types import Vessel
 from .vessels import make_vessel, resolve_category

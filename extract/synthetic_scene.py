@@ -5,7 +5,6 @@ MuJoCo is only the picture here: all moving parts are mocap bodies put where the
 
 from __future__ import annotations
 
-import os
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from .geometry import Array
+from .offscreen import load_mujoco
 from .synthetic_hand import FOREARM, Grip, forearm_poses, hand_capsules
 from .synthetic_look import vessel_look
 from .synthetic_motion import Camera, PourPath
@@ -24,14 +24,6 @@ if TYPE_CHECKING:
 # Segmentation classes, stored as geom groups so that the renderer can also show one of them alone.
 SCENERY, OBJECT, RECEPTACLE, HAND = 0, 1, 2, 3
 _OPENCV_TO_OPENGL = np.diag([1.0, -1.0, -1.0])
-
-
-def load_mujoco() -> Any:
-    """Import MuJoCo with an off-screen back end: EGL needs no display, and the choice is read at import time only."""
-    os.environ.setdefault("MUJOCO_GL", "egl")
-    import mujoco
-
-    return mujoco
 
 
 class Scene:
