@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..extract.errors import UserError
+from ..extract.offscreen import load_mujoco
 
 
 class Cameras:
@@ -29,6 +30,7 @@ class Cameras:
         return np.asarray(renderer.render())
 
     def _make(self, size: tuple[int, int]) -> Any:
+        load_mujoco()  # without a screen MuJoCo's own choice of back end would end the process
         try:
             renderer = mujoco.Renderer(self._model, *size)
         except Exception as error:  # MuJoCo raises whatever its GL backend raises

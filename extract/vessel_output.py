@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ import numpy as np
 
 from .errors import UserError
 from .files import atomic_path
+from .offscreen import load_mujoco
 from .vessel_types import Vessel
 from .vessels import CATEGORIES, make_vessel, parameter_space
 
@@ -129,10 +129,7 @@ def render_vessel(
     vessel: Vessel, size_px: int = 240, *, elevation_deg: float = 22.0, azimuth_deg: float = 115.0
 ) -> np.ndarray[Any, np.dtype[np.uint8]]:
     """(size_px, size_px, 3) picture of a vessel by MuJoCo's renderer, framed to fill it."""
-    # Read when MuJoCo is first imported; EGL needs no display.
-    os.environ.setdefault("MUJOCO_GL", "egl")
-    import mujoco
-
+    mujoco = load_mujoco()
     spec = mujoco.MjSpec()
     spec.visual.global_.offwidth = spec.visual.global_.offheight = size_px
     spec.visual.global_.fovy = 30.0
