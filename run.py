@@ -206,10 +206,12 @@ def collect_stage(reference: Path, folder: Path, *, episodes: int, seed: int, re
     """Reference -> dataset/ of verified episodes. replace: also where a dataset of another reference is."""
 
     def work(progress: Progress) -> Mapping[str, Any]:
-        from .demos.collect import collect
+        from .demos.collect import collect, useful_workers
 
-        dataset = folder / "dataset"
-        return collect(reference, dataset, episodes=episodes, seed=seed, force=replace, progress=progress)
+        dataset, workers = folder / "dataset", useful_workers(episodes)
+        return collect(
+            reference, dataset, episodes=episodes, seed=seed, workers=workers, force=replace, progress=progress
+        )
 
     return Stage(
         "collect",

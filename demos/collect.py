@@ -10,6 +10,7 @@ import fcntl
 import json
 import os
 import shutil
+import threading
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
@@ -22,7 +23,7 @@ from ..extract.errors import UserError
 from ..extract.files import sha256_of_file, write_json
 from ..extract.stages import Progress, code_hash, plain, versions
 from .attempt import AttemptRunner, AttemptSettings, episode_file
-from .dataset import require_lerobot, write_dataset
+from .dataset import import_lerobot, require_lerobot, write_dataset
 from .rollout import DEFAULT_ENV_ID
 from .stored import COLLECTION_FILE, check_dataset, read_collection
 from .workers import attempts_in_order
@@ -52,6 +53,7 @@ def collect(
     """Write a dataset of `episodes` successful, replayed roll-outs of a reference to the folder `out`.
 
     image_size: (height, width) in px, even numbers.  env_kwargs: further arguments of the environment.
+    workers: processes; more than one needs a main module that can be imported (`if __name__ == "__main__":`).
     max_attempts: 5 per episode by default, at least 20. When it is reached with fewer successes than asked for, the
         dataset holds those there are and the returned `complete` is False.
     force: replace a dataset at `out` that was made from another reference or with other settings.
@@ -78,6 +80,9 @@ def collect(
     with _only_one(work):
         attempts_folder = _attempts_folder(work, identity)
         runner = AttemptRunner(settings, attempts_folder)
+        if workers > 1:
+            # This process only waits while the others work: it may as well load what it will need at the end.
+            threading.Thread(target=import_lerobot, daemon=True).start()
         try:
             layout = runner.layout(task_of(reference))
             kept, failed, tried = _attempt(settings, attempts_folder, episodes, limit, workers, runner, progress)
@@ -104,6 +109,11 @@ def collect(
         os.rename(part, out)
         shutil.rmtree(work)
     return _figures(out, read_collection(out))
+
+
+def useful_workers(episodes: int) -> int:
+    """As many processes as this machine has processors for, and no more than there are episodes."""
+    return max(1, min(len(os.sched_getaffinity(0)), episodes))
 
 
 def task_of(reference: Reference) -> str:
