@@ -67,8 +67,11 @@ def _of_region(region: GraspRegion, vessel: Vessel) -> list[Grasp]:
     approach = region.approach - (region.approach @ axis) * axis
     approach /= np.linalg.norm(approach)
     upright = abs(axis[2]) > 0.9
-    around = region.kind == "body" and upright and vessel.section.kind == "round"
-    # A round body can be approached from anywhere, a handle from about where it points to.
+    lying = abs(axis[2]) < 0.5
+    around = (region.kind == "body" and upright and vessel.section.kind == "round") or (
+        region.kind == "handle" and lying
+    )
+    # A round body and a lying handle can be approached from anywhere, other handles from about where they point to.
     turns_rad = np.arange(12) * np.pi / 6 if around else np.deg2rad([0.0, -25.0, 25.0])
     if region.kind == "body" and not around:
         turns_rad = np.array([0.0, np.pi])
@@ -81,7 +84,9 @@ def _of_region(region: GraspRegion, vessel: Vessel) -> list[Grasp]:
             for slide in (-0.3, 0.0, 0.3):
                 center = region.center_m + slide * region.length_m * axis
                 cost = 0.3 * (pitch_deg / 60.0) ** 2 + 0.1 * abs(slide) + (0.1 if region.kind == "body" else 0.0)
-                if not around:
+                if lying:
+                    cost += 0.1 * (1.0 + float(z[2]))  # from above is how one takes it
+                elif not around:
                     cost += 0.2 * abs(turn_rad) / np.pi
                 if region.width_m > MAX_WIDTH_M:
                     cost += 1.0

@@ -267,10 +267,6 @@ def _make_stage(
             reasons.append("the path goes lower later")
         notes.append(f"The vessel starts {100 * start_m:.1f} cm above the table: {' and '.join(reasons)}.")
     notes += placed.notes
-    if np.rad2deg(tilt_rad(T).max()) < 20.0:
-        notes.append(
-            f"The vessel never tilts by more than {np.rad2deg(tilt_rad(T).max()):.0f} degrees: little will pour."
-        )
     time_s = np.arange(len(T)) / control_hz
     return Stage(T, time_s, vessel, receptacle, placed.T_receptacle), notes, placed.caught
 

@@ -18,7 +18,7 @@ from ..extract.geometry import Array, rotation_angle_rad
 from .collision import Collision, CollisionChecker
 from .grasps import Grasp, grasp_candidates
 from .jet import tilt_rad
-from .kinematics import arm_seeds, limit_margin_rad, manipulability, solve_ik
+from .kinematics import arm_seeds, limit_margin_rad, manipulability, panda_chain, solve_ik
 from .panda import DQ_MAX_RAD_S, Q_HOME_RAD, Q_MAX_RAD, Q_MIN_RAD
 
 if TYPE_CHECKING:
@@ -29,6 +29,8 @@ POSITION_TOLERANCE_M, ROTATION_TOLERANCE_RAD = 1e-3, np.deg2rad(0.5)
 _TCP_TO_WRIST_M, _WRIST_REACH_M, _WRIST_NEAR_M = 0.2104, 0.79, 0.2
 _SHOULDER = np.array([0.0, 0.0, 0.333])
 _TABLE_CLEARANCE_M = 0.01
+# Height of the wrist joints' origins under which their housings come near the table.
+_WRIST_CLEARANCE_M = 0.13
 # Where people look for the pour, and cameras are aimed: straight in front, within easy reach.
 _CENTRE_M = np.array([0.5, 0.0])
 _KNOTS, _SCREENED, _CHAINED = 12, 3000, 1200
@@ -223,11 +225,13 @@ def _costs(stage: Stage, batch: _Batch, q: Array, grasps: list[Grasp], time_s: A
     count = q.shape[1]
     margin = limit_margin_rad(q).min(axis=(1, 2))
     skill = manipulability(q.reshape(-1, 7)).reshape(-1, count).min(axis=1)
+    wrist_m = panda_chain().frames(q.reshape(-1, 7))[:, 4:7, 2, 3].reshape(len(q), -1).min(axis=1)
     speed = (np.abs(np.diff(q, axis=1)) / np.diff(time_s)[:, None] / DQ_MAX_RAD_S).max(axis=(1, 2))
     away = np.mean(((q - Q_HOME_RAD) / (Q_MAX_RAD - Q_MIN_RAD)) ** 2, axis=(1, 2))
     return np.asarray(
         2.0 * np.clip(0.35 - margin, 0, None) / 0.35
         + 1.5 * np.clip(0.06 - skill, 0, None) / 0.06
+        + 1.5 * np.clip(_WRIST_CLEARANCE_M - wrist_m, 0, None) / _WRIST_CLEARANCE_M
         + np.clip(speed - 0.5, 0, None)
         + 3.0 * away
         + np.array([grasps[i].cost for i in batch.grasp])

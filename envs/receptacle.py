@@ -87,6 +87,11 @@ def place_receptacle(
         notes.append(
             f"The jet wanders while pouring: the receptacle can catch about {100 * caught:.0f}% of it where it stands."
         )
+    if jet.poured < 0.5:
+        notes.append(
+            f"Its greatest tilt of {np.rad2deg(tilt_rad(T).max()):.0f} degrees empties the vessel only in part: about "
+            f"{100 * jet.poured:.0f}% leave of a filling that takes up a quarter of it or half of the receptacle."
+        )
     return ReceptaclePlacement(T_receptacle, lift_m, caught, notes)
 
 
