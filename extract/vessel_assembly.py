@@ -158,18 +158,19 @@ def beak(walls: Walls, rgba: Color, radius_m: float) -> tuple[Part, Outlet]:
     assert walls.lip is not None
     reach, top = walls.lip.reach_m, walls.height_m
     ceiling, inner = float(walls.inner[-1, 0]), float(walls.inner[-1, 1])
-    start = np.array([inner + 0.25 * reach - 0.5 * radius_m, ceiling - 0.5 * radius_m])
-    end = np.array([walls.outer_radius(top) + 0.85 * reach - 1.3 * radius_m, top])
-    direction = (end - start) / np.linalg.norm(end - start)
-    channel = tube(np.vstack([start, end + direction * (OVERCUT_M + radius_m)]), radius_m)
+    x = inner + 0.72 * reach - 1.2 * radius_m
+    lean = np.array([0.2, 1.0])
+    hole = np.array([[x, ceiling], [x, ceiling]]) + np.array([[-1.0], [1.0]]) * (top - ceiling + OVERCUT_M) * lean
     outlet = Outlet(
         "spout",
-        np.array([end[0], 0.0, end[1]]),
-        np.array([direction[0], 0.0, direction[1]]),
-        np.array([start[0], 0.0, ceiling]),
+        np.array([x, 0.0, top]),
+        # What comes through the hole runs on along the beak.
+        np.array([0.8, 0.0, 0.6]),
+        np.array([x, 0.0, ceiling]),
         radius_m,
         radius_m,
     )
+    channel = tube(hole, radius_m)
     return Part(channel, rgba), outlet
 
 

@@ -82,9 +82,11 @@ def gooseneck_kettle(p: Params, rgba: Color) -> Draft:
     radius = max(p["spout_radius_m"], p["wall_m"] + 0.0015)
     z0 = max(p["spout_start"] * h, walls.floor_m + radius + 0.002)
     wall_x = walls.outer_radius(z0)
-    reach = max(p["spout_reach_m"], wall_x + 0.03)
+    reach = max(p["spout_reach_m"], wall_x + 0.025 + 1.2 * radius)
     rise = max(p["spout_height_m"] - z0, 0.03)
-    tip_x = reach - p["spout_tip_m"]
+    # Shorter than this the bend would be tighter than the tube is wide.
+    tip_m = max(p["spout_tip_m"], 1.2 * radius)
+    tip_x = reach - tip_m
     run = tip_x - wall_x
     neck_out = max(p["spout_neck_out"], p["spout_foot"])
     polyline = np.array(
@@ -94,7 +96,7 @@ def gooseneck_kettle(p: Params, rgba: Color) -> Draft:
             [wall_x + p["spout_foot"] * run, z0 + 0.055 * rise],
             [wall_x + neck_out * run, z0 + p["spout_neck_up"] * rise],
             [tip_x, z0 + rise],
-            [reach, z0 + rise - 0.2 * p["spout_tip_m"]],
+            [reach, z0 + rise - 0.2 * tip_m],
         ]
     )
     path = rounded_path(polyline, [0.01, max(0.016, 2.2 * radius), 0.045, max(0.008, 1.5 * radius)], steps=8)
@@ -119,7 +121,9 @@ def gooseneck_kettle(p: Params, rgba: Color) -> Draft:
     x_in = -(walls.inner_radius(z_stub) - 0.004)
     x_metal = x_body - 0.3 * p["handle_gap_m"]
     stub = Part(tube(np.array([[x_in, z_stub], [x_metal - 0.002, z_stub]]), 0.9 * grip_r), STEEL)
-    arm = tube(np.array([[x_metal, z_stub], [x_bend, z_stub]]), np.array([0.95 * grip_r, grip_r]))
+    # To the middle of the stick, whose rounded bend stays short of its corner.
+    x_stick = float(np.interp(-z_stub, -grip_path[:, 1], grip_path[:, 0]))
+    arm = tube(np.array([[x_metal, z_stub], [x_stick, z_stub]]), np.array([0.95 * grip_r, grip_r]))
     hold = np.array([[x_bend, z_stub], [x_low, z_low]])
 
     return Draft(
@@ -181,11 +185,10 @@ def stovetop_kettle(p: Params, rgba: Color) -> Draft:
     tilt, length = p["spout_tilt_rad"], p["spout_length_m"]
     along = np.array([np.cos(tilt), np.sin(tilt)])
     corner = np.array([wall_x, z0])
-    # Straight through the wall; inside it stops where the body is wide enough for it.
-    inside = corner - along * min(3.0 * root, (z0 - walls.floor_m - 1.1 * root) / along[1])
+    # Straight through the wall, and inside level from the axis, where there is room for it.
+    inside = corner - along * min(3.0 * root, max(0.0, z0 - walls.floor_m - 1.2 * root) / along[1])
     tip = corner + length * along
-    step = 0.25 * root
-    path = rounded_path(np.array([inside, tip, tip + np.array([step, 0.35 * step])]), step, steps=6)
+    path = rounded_path(np.array([[0.0, inside[1]], inside, tip]), 1.3 * root, steps=6)
     tube_part, channel, outlet = spout(walls, path, root, p["spout_taper"] * root, max(p["wall_m"], 0.001), rgba)
 
     grip_r = p["handle_radius_m"]
@@ -260,7 +263,7 @@ def electric_kettle(p: Params, rgba: Color) -> Draft:
     )
     lid = [(h - 0.002, 0.93 * top), (h + 0.008, 0.90 * top), (h + 0.012, 0.7 * top)]
     stand, hollow = (lofted(np.array([[z, k * base], [foot, k * base]])) for z, k in ((0.0, 1.01), (-0.001, 0.94)))
-    channel, outlet = beak(walls, BLACK, 0.22 * p["beak_out_m"])
+    channel, outlet = beak(walls, BLACK, 0.2 * p["beak_out_m"])
     thick = 0.5 * p["handle_thickness_m"]
     z_top, z_low = h - thick - 0.006, max(p["handle_bottom"] * h, foot + thick)
     x_out = -(base + p["handle_reach_m"] - thick)

@@ -148,10 +148,10 @@ def round_off(profile: Array, bottom_m: float, top_m: float, *, top_outward: boo
     radius = np.interp(fine, z, r)
     if bottom_m > 0:
         depth = np.clip(low + bottom_m - fine, 0, bottom_m)
-        radius = radius - (bottom_m - np.sqrt(bottom_m**2 - depth**2))
+        radius = radius - (bottom_m - np.sqrt(np.maximum(bottom_m**2 - depth**2, 0.0)))
     if top_m > 0:
         depth = np.clip(fine - (high - top_m), 0, top_m)
-        change = top_m - np.sqrt(top_m**2 - depth**2)
+        change = top_m - np.sqrt(np.maximum(top_m**2 - depth**2, 0.0))
         radius = radius + change if top_outward else radius - change
     return np.column_stack([fine, radius])
 
