@@ -73,6 +73,7 @@ def pour_reference(
     short_m = 0.35 * float(receptacle.interior.radius_m[-1])
     over = rim - short_m * heading.apply([direction[0], direction[1], 0.0]) + [0.0, 0.0, clearance_m]
     tilting = over - R @ outlet
+    tilting[:, 2] += _rise_over_rim_m(vessel, receptacle, R, tilting - rim, tilt_rad)
     rise_m = max(float(tilting[0, 2] - start[2]), 0.05)
     lift = minimum_jerk(time_s / (LIFT_S + 0.3 * MOVE_S))
     move = minimum_jerk((time_s - 0.7 * LIFT_S) / (MOVE_S + 0.3 * LIFT_S))
@@ -92,6 +93,22 @@ def pour_reference(
         "notes": ["built-in motion, not from a video"],
     }
     return Reference.from_poses(T, time_s, header)
+
+
+def _rise_over_rim_m(vessel: Vessel, receptacle: Vessel, R: Array, above_rim_m: Array, tilt_rad: Array) -> Array:
+    """(N,) extra height that keeps the held body off the receptacle while it tilts, fading as the tilt grows.
+
+    R: (N, 3, 3) attitudes; above_rim_m: (N, 3) the vessel's origin seen from the middle of the receptacle's rim.
+    """
+    body = vessel.mesh.vertices[:: max(1, len(vessel.mesh.vertices) // 500)]
+    points = np.einsum("nij,kj->nki", R, body) + above_rim_m[:, None]
+    over = np.linalg.norm(points[..., :2], axis=2) < float(receptacle.exterior.radius_m[-1]) + 0.02
+    lowest_m = np.where(over, points[..., 2], np.inf).min(axis=1)
+    left = 1.0 - tilt_rad / tilt_rad[-1]
+    needed = np.maximum(0.012 - lowest_m, 0.0)
+    # Near the end of the tilt only the outlet itself is over the receptacle, and that is where it should be.
+    scale = float(np.max(needed[left > 0.25] / left[left > 0.25]))
+    return np.asarray(scale * left)
 
 
 def _reachable_grasp(vessel: Vessel, T_world_object: Array) -> tuple[Array, Array]:

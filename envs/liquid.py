@@ -50,12 +50,16 @@ class Liquid:
         if not 0.0 <= self.drag_kg_s <= 0.01:
             raise UserError(f"liquid drag_kg_s is {self.drag_kg_s}; choose 0 to 0.01 kg/s")
 
-    def radius_for(self, count: int, vessel_m3: float, receptacle_m3: float) -> float:
-        """The radius in m that `count` particles take in a vessel and a receptacle of these volumes."""
+    def radius_for(self, count: int, vessel_m3: float, receptacle_m3: float, throat_m: float) -> float:
+        """The radius in m that `count` particles take in a vessel and a receptacle of these volumes.
+
+        throat_m: radius of the narrowest place on the way out, where particles must not jam.
+        """
         if self.radius_m is not None:
             return self.radius_m
         share_m3 = min(0.25 * vessel_m3, 0.5 * receptacle_m3) * PACKING / max(count, 1)
-        return float(np.clip((share_m3 / (4 / 3 * math.pi)) ** (1 / 3), MIN_RADIUS_M, MAX_RADIUS_M))
+        radius_m = min((share_m3 / (4 / 3 * math.pi)) ** (1 / 3), 0.22 * throat_m)
+        return float(np.clip(radius_m, MIN_RADIUS_M, MAX_RADIUS_M))
 
 
 def fill_positions(cavity: Cavity, boxes: list[Box], count: int, radius_m: float, name: str) -> Array:
@@ -122,6 +126,9 @@ def count_particles(
     Poured: inside the receptacle's hollow. Held: inside the vessel's. Spilled: in neither and below the receptacle's
     rim, from where nothing finds back. The rest is in flight.
     """
+    if len(points_m) == 0:
+        nothing = np.zeros(0, bool)
+        return Count(nothing, nothing, nothing)
     poured = receptacle.contains((points_m - T_world_receptacle[:3, 3]) @ T_world_receptacle[:3, :3])
     held = vessel.contains((points_m - T_world_vessel[:3, 3]) @ T_world_vessel[:3, :3]) & ~poured
     rim = np.array([*receptacle.axis_xy_m, receptacle.rim_m])

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
+import mujoco
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from ..extract.geometry import Array, Symmetry, angle_between_rad, rotation_angle_rad
+from ..extract.geometry import Array
 from .panda import ARM_JOINTS
 from .reference import Reference, interpolate_poses
 
@@ -61,35 +63,56 @@ class Targets:
     """A reference prepared for fast comparison with the object's state at any of its knots."""
 
     def __init__(self, reference: Reference) -> None:
-        self._position_m = reference.T_world_object[:, :3, 3]
-        self._R = reference.T_world_object[:, :3, :3]
+        self._position_m = np.ascontiguousarray(reference.T_world_object[:, :3, 3])
+        R = reference.T_world_object[:, :3, :3]
+        symmetry = reference.symmetry
+        self._continuous = symmetry.order == 0
+        self._axis = np.asarray(symmetry.axis, float)
+        self._axes = R @ self._axis
+        # (N, K, 4): the attitudes that count as the same under a discrete symmetry.
+        images = R[:, None] @ (np.eye(3)[None] if self._continuous else symmetry.rotations())
+        self._quats = Rotation.from_matrix(images.reshape(-1, 3, 3)).as_quat(scalar_first=True)
+        self._quats = self._quats.reshape(len(R), -1, 4)
         self._twist = reference.twist_world
-        self._symmetry = reference.symmetry
-        self._axis = np.asarray(self._symmetry.axis, float)
-        self._continuous = self._symmetry.order == 0
         self._last = len(reference) - 1
-        self._steps = np.array([max(1, round(ahead * reference.control_hz)) for ahead in LOOK_AHEAD_S])
+        self._steps = [max(1, round(ahead * reference.control_hz)) for ahead in LOOK_AHEAD_S]
 
     def errors(self, index: int, position_m: Array, R: Array, twist: Array) -> tuple[float, float, float, float]:
         """Errors of position (m), rotation (rad, up to symmetry), linear (m/s) and angular velocity (rad/s) at a knot.
 
         R: (3, 3); twist: (6,) linear then angular, world axes. After the last knot the object should stand still.
         """
-        wanted = self._twist[index] if index < self._last else np.zeros(6)
-        spin = twist[3:] - wanted[3:]
+        error = twist - self._twist[index] if index < self._last else twist
+        spin = error[3:]
         if self._continuous:
             axis = R @ self._axis
             spin = spin - (spin @ axis) * axis
-        if self._symmetry.order == 1:
-            rotation_rad = float(rotation_angle_rad(R, self._R[index]))
-        else:
-            rotation_rad = float(self._symmetry.error_rad(R, self._R[index]))
         return (
-            float(np.linalg.norm(position_m - self._position_m[index])),
-            rotation_rad,
-            float(np.linalg.norm(twist[:3] - wanted[:3])),
-            float(np.linalg.norm(spin)),
+            _length(position_m - self._position_m[index]),
+            _length(self.turn_vector(index, R)),
+            _length(error[:3]),
+            _length(spin),
         )
+
+    def turn_vector(self, index: int, R: Array) -> Array:
+        """(3,) shortest rotation vector, world axes, that turns R (3, 3) into the knot's attitude up to symmetry."""
+        if self._continuous:
+            ax, ay, az = (R @ self._axis).tolist()
+            bx, by, bz = self._axes[index].tolist()
+            cross = np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
+            sine = _length(cross)
+            angle = math.atan2(sine, ax * bx + ay * by + az * bz)
+            if sine > 1e-9:
+                return np.asarray(cross * (angle / sine))
+            # Aligned, or opposite: then every axis across will do.
+            return np.zeros(3) if angle < 1.0 else angle * np.linalg.svd(np.array([[ax, ay, az]]))[2][1]
+        quat, local = np.empty(4), np.empty((len(self._quats[index]), 3))
+        mujoco.mju_mat2Quat(quat, R.ravel())
+        for vector, wanted in zip(local, self._quats[index], strict=True):
+            mujoco.mju_subQuat(vector, wanted, quat)
+        if len(local) > 1:
+            local = local[np.argmin(np.einsum("ij,ij->i", local, local))][None]
+        return np.asarray(R @ local[0])
 
     def environment_state(
         self,
@@ -101,38 +124,17 @@ class Targets:
         fractions: tuple[float, float, float],
     ) -> NDArray[np.float32]:
         """The vector named by `ENVIRONMENT_NAMES`; fractions: held, poured, spilled."""
-        ahead = np.minimum(index + self._steps, self._last)
-        offsets = self._position_m[ahead] - position_m
-        turns = turn_vectors(R, self._R[ahead], self._symmetry)
-        tilt_rad = float(np.arctan2(np.hypot(R[0, 2], R[1, 2]), R[2, 2]))
-        return np.concatenate(
-            [
-                position_m,
-                R[:, 0],
-                R[:, 2],
-                twist,
-                np.hstack([offsets, turns]).ravel(),
-                [tilt_rad, *fractions],
-                receptacle_m,
-                [index / self._last],
-            ]
-        ).astype(np.float32)
+        parts = [position_m, R[:, 0], R[:, 2], twist]
+        for step in self._steps:
+            ahead = min(index + step, self._last)
+            parts += [self._position_m[ahead] - position_m, self.turn_vector(ahead, R)]
+        tilt_rad = math.atan2(math.hypot(R[0, 2], R[1, 2]), R[2, 2])
+        parts += [np.array([tilt_rad, *fractions]), receptacle_m, np.array([index / self._last])]
+        return np.concatenate(parts).astype(np.float32)
 
 
-def turn_vectors(R: Array, R_target: Array, symmetry: Symmetry) -> Array:
-    """(M, 3) rotation vectors, world axes, that turn R (3, 3) into targets (M, 3, 3) most shortly, up to symmetry."""
-    if symmetry.order == 0:
-        a, b = R @ np.asarray(symmetry.axis), R_target @ np.asarray(symmetry.axis)
-        cross = np.cross(a, b)
-        sine = np.linalg.norm(cross, axis=1, keepdims=True)
-        angle = angle_between_rad(a, b)[:, None]
-        return np.asarray(cross * np.where(sine > 1e-9, angle / np.maximum(sine, 1e-9), 1.0))
-    if symmetry.order == 1:
-        return np.asarray(Rotation.from_matrix(R_target @ R.T).as_rotvec())
-    choices = symmetry.rotations()
-    turned = np.stack([Rotation.from_matrix(R_target @ (R @ S).T).as_rotvec() for S in choices])
-    best = np.argmin(np.linalg.norm(turned, axis=2), axis=0)
-    return np.asarray(turned[best, np.arange(len(R_target))])
+def _length(vector: Array) -> float:
+    return math.sqrt(float(vector @ vector))
 
 
 def resampled(reference: Reference, control_hz: float) -> Reference:

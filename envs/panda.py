@@ -48,8 +48,8 @@ DAMPING_NM_S_RAD: Array = SERVO_LEAD_S * STIFFNESS_NM_RAD
 CONTACT_PARTICLE, CONTACT_VESSEL, CONTACT_ROBOT = 1, 2, 4
 
 _COLORS = {"white": (0.93, 0.94, 0.95, 1.0), "dark": (0.24, 0.25, 0.27, 1.0), "blue": (0.04, 0.54, 0.78, 1.0)}
-_FACES_PER_LINK = 900
-_CACHE_VERSION = 1
+_FACES_PER_LINK = 2000
+_CACHE_VERSION = 2
 
 
 def joint_command(target_rad: Array, target_rad_s: Array) -> Array:

@@ -143,8 +143,8 @@ class PandaPourEnv(gym.Env[Observation, NDArray[np.float32]]):
         self._step_index = 0
         self._target: Array = self._base.q_start_rad
         self._target_speed: Array = np.zeros(7)
+        self._count: Count
         self._begin(np.zeros(3), np.zeros(3))
-        self._count: Count = self._counted()
 
     # ------------------------------------------------------------------ Gymnasium
 
@@ -170,10 +170,9 @@ class PandaPourEnv(gym.Env[Observation, NDArray[np.float32]]):
 
     def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, Info]:
         """Advance one control period."""
-        start = self._target
         target = self._target_from(np.asarray(action, np.float64))
-        speed = (target - start) * self.control_hz
-        ramp = start + self._fractions * (target - start) + SERVO_LEAD_S * speed
+        speed = (target - self._target) * self.control_hz
+        ramp = self._commands(target)
         data, model, control, step = self.data, self.model, self.data.ctrl, mujoco.mj_step
         for i in range(self._substeps):
             control[:7] = ramp[i]
@@ -182,14 +181,13 @@ class PandaPourEnv(gym.Env[Observation, NDArray[np.float32]]):
                 self._pour_through_spout(self._conduit)
         self._target, last_speed, self._target_speed = target, self._target_speed, speed
         self._step_index += 1
+        before = self._count
         self._refresh()
         if not np.all(np.isfinite(data.qpos)):
             raise PhysicsError(
                 f"the simulation diverged at step {self._step_index} of the episode with seed {self._seed}; "
                 "reset the environment, and use a smaller timestep_s or fewer particles if it happens again"
             )
-        before = self._count
-        self._count = self._counted()
         errors = self._errors(before, float(np.mean(((speed - last_speed) / (2 * DQ_MAX_RAD_S)) ** 2)))
         terms = weighted_terms(errors, self.reward_config)
         lost = (self.max_position_error_m is not None and errors.position_error_m > self.max_position_error_m) or (
@@ -244,7 +242,6 @@ class PandaPourEnv(gym.Env[Observation, NDArray[np.float32]]):
         self._step_index = int(state["step"])
         self.np_random.bit_generator.state = state["generator"]
         self._refresh()
-        self._count = self._counted()
 
     def reward_table(self) -> str:
         """The reward's terms, weights and scales in plain text."""
@@ -253,14 +250,12 @@ class PandaPourEnv(gym.Env[Observation, NDArray[np.float32]]):
     @property
     def T_world_object(self) -> Array:
         """(4, 4) pose of the held object now."""
-        return make_pose(self._vessel_xmat.reshape(3, 3), self._vessel_xpos)
+        return make_pose(self._vessel_R, self._vessel_xpos)
 
     @property
     def T_world_receptacle(self) -> Array:
         """(4, 4) pose of the receptacle in this episode."""
-        T = self._scene.T_world_receptacle.copy()
-        T[:3, 3] += self._receptacle_offset_m
-        return T
+        return self._T_world_receptacle.copy()
 
     @property
     def particle_positions_m(self) -> Array:
@@ -276,7 +271,9 @@ class PandaPourEnv(gym.Env[Observation, NDArray[np.float32]]):
             raise RuntimeError("the scene's joints are not in the order arm, fingers, particles")
         self._vessel_id = int(model.body(VESSEL_BODY).id)
         self._receptacle_id = int(model.body(RECEPTACLE_BODY).id)
-        self._vessel_xpos, self._vessel_xmat = data.xpos[self._vessel_id], data.xmat[self._vessel_id]
+        # Views into the simulator's memory: always the pose of the last kinematics.
+        self._vessel_xpos, self._vessel_R = data.xpos[self._vessel_id], data.xmat[self._vessel_id].reshape(3, 3)
+        self._arm_axes, self._arm_anchors = data.xaxis[:7], data.xanchor[:7]
         self._particle_qpos = data.qpos[9:].reshape(-1, 3)
         self._particle_qvel = data.qvel[9:].reshape(-1, 3)
         self._twist: Array = np.zeros(6)
@@ -311,7 +308,9 @@ class PandaPourEnv(gym.Env[Observation, NDArray[np.float32]]):
         self._start_offset_m, self._receptacle_offset_m = start_m, receptacle_m
         self.reference = self._base.warped(tuple(start_m), tuple(receptacle_m))
         self._targets = observations.Targets(self.reference)
-        self.model.body_pos[self._receptacle_id] = self.T_world_receptacle[:3, 3]
+        self._T_world_receptacle = self._scene.T_world_receptacle.copy()
+        self._T_world_receptacle[:3, 3] += receptacle_m
+        self.model.body_pos[self._receptacle_id] = self._T_world_receptacle[:3, 3]
 
     def _begin(self, start_m: Array, receptacle_m: Array) -> None:
         self._place(start_m, receptacle_m)
@@ -322,19 +321,24 @@ class PandaPourEnv(gym.Env[Observation, NDArray[np.float32]]):
         self._target, self._target_speed = q_rad.copy(), np.zeros(7)
         self._step_index = 0
         self._refresh()
-        self._count = self._counted()
 
     def _refresh(self) -> None:
-        """Bring poses and velocities up to the state; after a restored state they must be what they were before."""
+        """Bring all that is derived up to the state; after a restored state it must be what it was before."""
         mujoco.mj_kinematics(self.model, self.data)
-        mujoco.mj_comPos(self.model, self.data)
-        mujoco.mj_comVel(self.model, self.data)
         self._read_twist()
+        self._count = self._counted()
+        self._tracking_errors = self._targets.errors(
+            self._reference_index, self._vessel_xpos, self._vessel_R, self._twist
+        )
 
     def _read_twist(self) -> None:
-        spatial = np.empty(6)
-        mujoco.mj_objectVelocity(self.model, self.data, mujoco.mjtObj.mjOBJ_XBODY, self._vessel_id, spatial, 0)
-        self._twist = np.concatenate([spatial[3:], spatial[:3]])
+        # Seven joints move the vessel; the engine's own velocities would first go through every particle.
+        rates = self._arm_axes * self.data.qvel[:7, None]
+        arms = self._vessel_xpos - self._arm_anchors
+        self._twist[3:] = rates.sum(axis=0)
+        self._twist[0] = rates[:, 1] @ arms[:, 2] - rates[:, 2] @ arms[:, 1]
+        self._twist[1] = rates[:, 2] @ arms[:, 0] - rates[:, 0] @ arms[:, 2]
+        self._twist[2] = rates[:, 0] @ arms[:, 1] - rates[:, 1] @ arms[:, 0]
 
     def _pour_through_spout(self, conduit: SpoutConduit) -> None:
         T = self.T_world_object
@@ -349,6 +353,11 @@ class PandaPourEnv(gym.Env[Observation, NDArray[np.float32]]):
         step = np.clip(wanted - self._target, -self._delta_rad, self._delta_rad)
         return np.clip(self._target + step, Q_MIN_RAD, Q_MAX_RAD)
 
+    def _commands(self, target: Array) -> Array:
+        """(substeps, 7) servo commands of one control period: straight to the target, leading by the servos' lag."""
+        way = target - self._target
+        return self._target + self._fractions * way + (SERVO_LEAD_S * self.control_hz) * way
+
     def _counted(self) -> Count:
         scene = self._scene
         return count_particles(
@@ -356,7 +365,7 @@ class PandaPourEnv(gym.Env[Observation, NDArray[np.float32]]):
             scene.vessel_cavity,
             self.T_world_object,
             scene.receptacle_cavity,
-            self.T_world_receptacle,
+            self._T_world_receptacle,
         )
 
     @property
@@ -370,15 +379,9 @@ class PandaPourEnv(gym.Env[Observation, NDArray[np.float32]]):
         )
 
     def _errors(self, before: Count, action_rate: float) -> StepErrors:
-        position_m, rotation_rad, linear, angular = self._targets.errors(
-            self._reference_index, self._vessel_xpos, self._vessel_xmat.reshape(3, 3), self._twist
-        )
         now = self._count
         return StepErrors(
-            position_m,
-            rotation_rad,
-            linear,
-            angular,
+            *self._tracking_errors,
             now.poured_fraction - before.poured_fraction,
             now.spilled_fraction - before.spilled_fraction,
             action_rate,
@@ -392,9 +395,9 @@ class PandaPourEnv(gym.Env[Observation, NDArray[np.float32]]):
             observation["environment_state"] = self._targets.environment_state(
                 self._reference_index,
                 self._vessel_xpos,
-                self._vessel_xmat.reshape(3, 3),
+                self._vessel_R,
                 self._twist,
-                self.T_world_receptacle[:3, 3],
+                self._T_world_receptacle[:3, 3],
                 (self._count.held_fraction, self._count.poured_fraction, self._count.spilled_fraction),
             )
         if self.obs_mode != "state":
@@ -404,9 +407,7 @@ class PandaPourEnv(gym.Env[Observation, NDArray[np.float32]]):
         return observation
 
     def _info(self, terms: dict[str, float]) -> Info:
-        position_m, rotation_rad, _, _ = self._targets.errors(
-            self._reference_index, self._vessel_xpos, self._vessel_xmat.reshape(3, 3), self._twist
-        )
+        position_m, rotation_rad, _, _ = self._tracking_errors
         info: Info = {
             "reward_terms": terms,
             "poured_fraction": self._count.poured_fraction,
@@ -416,7 +417,7 @@ class PandaPourEnv(gym.Env[Observation, NDArray[np.float32]]):
             "rotation_error_rad": rotation_rad,
             "reference_index": self._reference_index,
             "is_success": self._is_success(),
-            "outlet": "lip" if self._conduit is None else "spout_conduit",
+            "outlet": "spout_conduit" if self._scene.vessel.outlet.kind == "spout" else "lip",
         }
         if self._settled_held < self._scene.num_particles:
             lost = self._scene.num_particles - self._settled_held

@@ -60,7 +60,8 @@ def build_scene(reference: Reference, num_particles: int, liquid: Liquid, timest
     """
     vessel, receptacle = reference.vessel(), reference.receptacle()
     vessel_cavity, receptacle_cavity = cavity_of(vessel), cavity_of(receptacle)
-    radius_m = liquid.radius_for(num_particles, vessel_cavity.volume_m3, receptacle_cavity.volume_m3)
+    throat_m = vessel_cavity.throat_m if vessel.outlet.kind == "lip" else math.inf
+    radius_m = liquid.radius_for(num_particles, vessel_cavity.volume_m3, receptacle_cavity.volume_m3, throat_m)
     T_world_receptacle = reference.T_world_receptacle
 
     spec = panda_spec()
@@ -259,13 +260,14 @@ def _add_cameras(spec: mujoco.MjSpec, reference: Reference, vessel: Vessel, T_wo
     size_m = float(np.linalg.norm(high - low)) / 2 + 0.75 * float(np.linalg.norm(vessel.extents_m))
     fovy_deg = 45.0
     distance_m = max(0.5, 0.85 * size_m / math.sin(math.radians(fovy_deg / 2)))
-    # The stream lies in the vertical plane through lip and receptacle: the side camera looks across it.
-    outlet = reference.T_world_object[reference.pour_index, :3, :3] @ vessel.outlet.direction
-    heading = math.atan2(float(outlet[1]), float(outlet[0]))
-    across = heading + math.pi / 2
-    if math.cos(across) < 0 or (abs(math.cos(across)) < 0.2 and math.sin(across) > 0):
-        across += math.pi  # never from behind the robot
-    for name, azimuth, elevation_deg, reach in (("front", 0.35, 22.0, 1.0), ("side", across, 10.0, 0.85)):
+    # The stream lies in the vertical plane into which the vessel tilts: the side camera looks across it, or where the
+    # front camera does so already, against it; never from behind the robot.
+    upright = reference.T_world_object[reference.pour_index, :3, 2]
+    heading = math.atan2(float(upright[1]), float(upright[0]))
+    front = 0.35
+    choices = [heading + turn for turn in (-math.pi / 2, math.pi / 2, 0.0) if math.cos(heading + turn) > -0.4]
+    across = min(choices, key=lambda azimuth: math.cos(azimuth - front))
+    for name, azimuth, elevation_deg, reach in (("front", front, 22.0, 1.0), ("side", across, 16.0, 0.9)):
         rise = math.radians(elevation_deg)
         away = np.array([math.cos(azimuth) * math.cos(rise), math.sin(azimuth) * math.cos(rise), math.sin(rise)])
         _add_camera(

@@ -23,8 +23,11 @@ if TYPE_CHECKING:
 MAX_FRUSTA = 4
 PROFILE_TOLERANCE_M = 0.0004
 # A particle that has sunk past the middle of a box is pushed out on the wrong side. 8 mm holds against anything the
-# arm can do at 2 ms steps; at the rim it is less so that the contents leave where the drawn wall ends.
-WALL_M, RIM_WALL_M = 0.008, 0.006
+# arm can do at 2 ms steps; at the rim it is less so that the contents leave where the drawn wall ends. Floors and lids
+# carry the whole load in a shake and may be thicker unseen.
+WALL_M, RIM_WALL_M, PLATE_M = 0.008, 0.006, 0.015
+# Strips shorter than a particle would only add edges for it to be squeezed between.
+MIN_STRIP_M = 0.01
 WIDE_RADIUS_M = 0.045
 
 
@@ -83,6 +86,12 @@ class Cavity:
     def reach_m(self) -> float:
         """Greatest distance of a wall from the axis."""
         return float(self.support_m.max())
+
+    @property
+    def throat_m(self) -> float:
+        """Half width of the narrowest section between the widest one and the rim."""
+        widths = self.support_m.min(axis=1)
+        return float(widths[int(np.argmax(widths)) :].min())
 
     @property
     def volume_m3(self) -> float:
@@ -154,8 +163,8 @@ class Cavity:
         round_ = bool(np.ptp(support) < 0.05 * support.max())
         n = len(support)
         half_x, half_y = support[0] + WALL_M, support[n // 4] + WALL_M
-        z = self.z_m[level] + (WALL_M if above else -WALL_M) / 2
-        return Box(np.array([*self.axis_xy_m, z]), np.eye(3), np.array([half_x, half_y, WALL_M / 2]), round_)
+        z = self.z_m[level] + (PLATE_M if above else -PLATE_M) / 2
+        return Box(np.array([*self.axis_xy_m, z]), np.eye(3), np.array([half_x, half_y, PLATE_M / 2]), round_)
 
     def _edge_ends(self, step: float) -> tuple[Array, Array]:
         """(L, n) tangential coordinates of both ends of each edge: where neighbouring edges cross."""
@@ -169,7 +178,8 @@ def cavity_of(vessel: Vessel) -> Cavity:
     """The hollow of a vessel, with at most `MAX_FRUSTA` frusta of 12 (16 if wide) sides and the true section areas."""
     profile = vessel.interior
     keep = _levels(np.column_stack([profile.z_m, profile.radius_m]))
-    z, r, corner = profile.z_m[keep], profile.radius_m[keep], profile.corner[keep]
+    z, corner = profile.z_m[keep], profile.corner[keep]
+    r = _fitted_radii(profile.z_m, profile.radius_m, z)
     n = 16 if r.max() > WIDE_RADIUS_M else 12
     angle = 2 * np.pi * np.arange(n) / n
     normals = np.column_stack([np.cos(angle), np.sin(angle)])
@@ -185,15 +195,28 @@ def cavity_of(vessel: Vessel) -> Cavity:
 def _levels(profile: Array) -> NDArray[np.int64]:
     """Indices of at most `MAX_FRUSTA` + 1 profile points, always the worst-fitting one added next."""
     keep = [0, len(profile) - 1]
+    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(profile, axis=0), axis=1))])
     while len(keep) <= MAX_FRUSTA:
         chord_r = np.interp(profile[:, 0], profile[keep, 0], profile[keep, 1])
         chord_slope = np.gradient(chord_r, profile[:, 0])
         error = np.abs(profile[:, 1] - chord_r) / np.sqrt(1 + chord_slope**2)
+        error[np.abs(length[:, None] - length[keep]).min(axis=1) < MIN_STRIP_M] = 0.0
         worst = int(np.argmax(error))
         if error[worst] < PROFILE_TOLERANCE_M:
             break
         keep = sorted({*keep, worst})
     return np.array(keep)
+
+
+def _fitted_radii(z: Array, r: Array, levels: Array) -> Array:
+    """Radii at `levels` whose straight joins come nearest to the profile (z, r), in the sense of squared areas."""
+    fine = np.linspace(z[0], z[-1], 400)
+    hats = np.stack([np.interp(fine, levels, row) for row in np.eye(len(levels))], axis=1)
+    wanted = np.interp(fine, z, r)
+    weight = np.sqrt(wanted)[:, None]
+    fitted = np.linalg.lstsq(hats * weight, wanted * weight[:, 0], rcond=None)[0]
+    # Narrow floors (a bowl's) must not be fitted away.
+    return np.asarray(np.maximum(fitted, 0.25 * np.interp(levels, z, r)))
 
 
 def collision_boxes(vessel: Vessel, cavity: Cavity) -> list[Box]:

@@ -1,0 +1,99 @@
+"""How fast PandaPour steps, resets and renders, as ratios that do not depend on the machine.
+
+    OMP_NUM_THREADS=1 MUJOCO_GL=egl python bench/env_speed.py [--json]
+
+`step / mj_step` compares `env.step` with the bare physics steps inside it, both timed in this process and turn by
+turn on the same states; `x real time` is simulated time over CPU time of one thread.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from typing import Any
+
+import mujoco
+import numpy as np
+from vid2demo.envs.builtin import arm_trajectory, builtin_reference
+from vid2demo.envs.pouring import PandaPourEnv
+
+PARTICLES = (0, 50, 100, 300)
+SIZES = ((96, 96), (224, 224), (480, 640))
+
+
+def step_cost(env: PandaPourEnv, actions: np.ndarray[Any, Any]) -> tuple[float, float]:
+    """CPU seconds of a whole episode of `env.step` and of its physics steps alone.
+
+    Each control period runs twice from the same state: once bare, with the commands the environment gives, then
+    restored and through `env.step`.
+    """
+    env.reset(seed=0)
+    whole_s, bare_s = 0.0, 0.0
+    for action in actions:
+        state = env.get_state()
+        env.set_state(state)  # before both, so that both start with the same caches
+        commands = env._commands(env._target_from(np.asarray(action, np.float64)))
+        control = env.data.ctrl
+        start = time.process_time()
+        for command in commands:
+            control[:7] = command
+            mujoco.mj_step(env.model, env.data)
+        bare_s += time.process_time() - start
+        env.set_state(state)
+        start = time.process_time()
+        env.step(action)
+        whole_s += time.process_time() - start
+    return whole_s, bare_s
+
+
+def main() -> None:
+    reference = builtin_reference()
+    q_rad = arm_trajectory(reference).astype(np.float32)
+    rows = []
+    for count in PARTICLES:
+        start = time.process_time()
+        env = PandaPourEnv(reference, num_particles=count)
+        make_s = time.process_time() - start
+        steps = env._max_episode_steps
+        actions = q_rad[np.minimum(np.arange(1, steps + 1), len(q_rad) - 1)]
+        whole_s, bare_s = step_cost(env, actions)
+        start = time.process_time()
+        for seed in range(20):
+            env.reset(seed=seed)
+        reset_s = (time.process_time() - start) / 20
+        rows.append(
+            {
+                "particles": count,
+                "step_over_mj_step": whole_s / bare_s,
+                "times_real_time": steps / env.control_hz / whole_s,
+                "env_steps_per_s": steps / whole_s,
+                "overhead_us_per_step": 1e6 * (whole_s - bare_s) / steps,
+                "reset_ms": 1e3 * reset_s,
+                "make_ms": 1e3 * make_s,
+            }
+        )
+    env = PandaPourEnv(reference, num_particles=100)
+    env.reset(seed=0)
+    pictures = {}
+    for size in SIZES:
+        env._renderer.picture(env.data, "front", size)
+        start = time.process_time()
+        for _ in range(20):
+            env._renderer.picture(env.data, "front", size)
+        pictures[f"{size[1]}x{size[0]}"] = 20 / (time.process_time() - start)
+    env.close()
+    if "--json" in sys.argv:
+        print(json.dumps({"steps": rows, "pictures_per_cpu_s": pictures}, indent=2))
+        return
+    print(f"{'particles':>9} {'step/mj_step':>13} {'x real time':>12} {'steps/s':>8} {'+us/step':>9} {'reset ms':>9}")
+    for row in rows:
+        print(
+            f"{row['particles']:>9} {row['step_over_mj_step']:>13.3f} {row['times_real_time']:>12.1f} "
+            f"{row['env_steps_per_s']:>8.0f} {row['overhead_us_per_step']:>9.0f} {row['reset_ms']:>9.2f}"
+        )
+    print("pictures per CPU second:", ", ".join(f"{size}: {rate:.0f}" for size, rate in pictures.items()))
+
+
+if __name__ == "__main__":
+    main()
