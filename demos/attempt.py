@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..envs.panda import ARM_JOINTS
+from ..envs.pouring import PhysicsError
 from ..extract.errors import UserError
 from ..extract.files import write_json
 from .dataset import DatasetLayout
@@ -85,6 +86,8 @@ class AttemptRunner:
             tried = roll_out(self._env, ReferencePlayer(), seed=seed)
         except UserError as error:
             result |= {"reason": "the arm cannot follow the motion", "detail": str(error)}
+        except PhysicsError as error:
+            result |= {"reason": "the simulation diverged", "detail": str(error)}
         else:
             result["summary"] = dict(tried.summary)
             if tried.is_success:

@@ -229,7 +229,10 @@ def _attempts_folder(work: Path, identity: Mapping[str, Any]) -> Path:
 @contextmanager
 def _only_one(work: Path) -> Iterator[None]:
     """Hold the work folder for this process; the system lets go of it however the process ends."""
-    work.mkdir(parents=True, exist_ok=True)
+    try:
+        work.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"--out {work.parent} cannot be made ({error.strerror}); name another folder") from error
     handle = os.open(work, os.O_RDONLY)
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -12,6 +12,7 @@ import numpy as np
 
 from ..demos.attempt import failure_reason
 from ..demos.rollout import DEFAULT_ENV_ID, Controller, make_env, roll_out
+from ..envs.pouring import PhysicsError
 from ..extract.errors import UserError
 from ..extract.stages import Progress, plain, versions
 
@@ -87,7 +88,8 @@ def evaluate(
 
     reference: a `*.reference.npz`, or None for the environment's built-in one.
     env_kwargs: arguments of the environment; low randomisation unless they say otherwise.
-    An episode in which the policy refuses to act (UserError) counts as a failure, with the sentence as its reason.
+    An episode in which the policy refuses to act (UserError) or the simulation diverges counts as a failure, with the
+    error's sentence as its reason.
     """
     if episodes < 1:
         raise UserError(f"--episodes is {episodes}, it must be at least 1")
@@ -128,7 +130,7 @@ def wilson_interval(successes: int, trials: int, z: float = _Z_95) -> tuple[floa
 def _row(env: Any, policy: Controller, index: int, seed: int) -> dict[str, Any]:
     try:
         episode = roll_out(env, policy, seed=seed)
-    except UserError as error:
+    except (UserError, PhysicsError) as error:
         return {"index": index, "seed": seed, "success": False, "reason": str(error)}
     success = episode.is_success
     reason = None if success else failure_reason(episode.summary, env.unwrapped)

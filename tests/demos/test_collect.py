@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import json
+import socket
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from vid2demo.demos import attempt
 from vid2demo.demos import collect as collect_module
 from vid2demo.demos.attempt import attempt_seed, finished_attempt
 from vid2demo.demos.collect import collect
 from vid2demo.demos.stored import read_collection, read_columns
+from vid2demo.envs.pouring import PhysicsError
 from vid2demo.extract.errors import UserError
 
 
@@ -167,6 +170,38 @@ def test_two_collects_in_one_place_are_refused(stand_in: str, stand_in_reference
 def test_bad_input(stand_in: str, stand_in_reference: Path, tmp_path: Path, change: dict[str, Any], words: str) -> None:
     with pytest.raises(UserError, match=words):
         run(stand_in_reference, tmp_path / "dataset", stand_in, **change)
+
+
+def test_folder_that_cannot_be_made(stand_in: str, stand_in_reference: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(UserError, match="cannot be made"):
+        run(stand_in_reference, tmp_path / "file" / "dataset", stand_in)
+
+
+def test_nothing_asks_the_network(
+    stand_in: str, stand_in_reference: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: Any) -> None:
+        raise AssertionError("the network was asked")
+
+    monkeypatch.setattr(socket.socket, "connect", refuse)
+    monkeypatch.setattr(socket, "getaddrinfo", refuse)
+    run(stand_in_reference, tmp_path / "dataset", stand_in)
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    assert len(LeRobotDataset("vid2demo/test", root=tmp_path / "dataset")) == 18
+
+
+def test_diverged_simulation_is_a_failure_that_is_counted(
+    stand_in: str, stand_in_reference: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Wild:
+        def reset(self, env: Any, observation: Any, info: Any) -> None:
+            raise PhysicsError("the simulation diverged at step 0")
+
+    monkeypatch.setattr(attempt, "ReferencePlayer", Wild)
+    with pytest.raises(UserError, match="the simulation diverged: 20"):
+        run(stand_in_reference, tmp_path / "dataset", stand_in)
 
 
 def test_missing_reference(stand_in: str, tmp_path: Path) -> None:
