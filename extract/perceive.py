@@ -17,6 +17,7 @@ from .detect import find_object, motion_since
 from .errors import UserError
 from .files import atomic_path
 from .first_pose import PoseCandidate, find_first_pose, judge
+from .follow import Followed
 from .geometry import Array, Symmetry, focal_prior_camera_matrix
 from .meshes import load_mesh, mesh_sha256
 from .overlay import OverlayItem, write_overlay
@@ -27,7 +28,6 @@ from .segment import Box, Mask, check_box, mask_box, mask_from_box, mask_from_si
 from .shape_fit import View, coloured, fit_shape, tracking_mesh
 from .smoothing import smooth_poses
 from .track import ObjectTrack
-from .tracker import ObjectTracker
 from .vessels import Vessel, make_vessel, resolve_category
 from .video import Image, VideoInfo, iterate_frames, read_video_info
 
@@ -122,29 +122,38 @@ def extract(
         start_box = _scaled(box, start_scale)
         starts.append(_start(request, info, candidates, sharp, start_box, source, start_camera))
 
-    trackers = [
-        ObjectTracker(s.model.mesh, working_camera, first.rgb, _resized(s.mask, first.rgb), s.pose.T_camera_object)
-        for s in starts
-    ]
-    times: list[float] = []
-    estimates: list[list[Any]] = [[] for _ in trackers]
-    for frame in iterate_frames(info.path, WORKING_SIDE_PX):
-        times.append(frame.time_s)
-        for tracker, found in zip(trackers, estimates, strict=True):
-            found.append(tracker.step(frame.rgb))
-        report(frame.index + 1, info.frame_count, "following")
+    def follow(again: list[Followed] | None, words: str) -> list[Followed]:
+        frames = iterate_frames(info.path, WORKING_SIDE_PX)
+        masks = [_resized(start.mask, first.rgb) for start in starts]
+        followers = again or [
+            Followed.start(s.model.mesh, s.model.vessel, working_camera, first.rgb, m, s.pose.T_camera_object)
+            for s, m in zip(starts, masks, strict=True)
+        ]
+        for frame in frames:
+            for follower in followers:
+                follower.step(frame.rgb, frame.index, info.frame_count)
+            report(frame.index + 1, info.frame_count, words)
+            times[frame.index] = frame.time_s
+        return followers
+
+    times: dict[int, float] = {}
+    passed = follow(None, "following")
+    report(0, info.frame_count, "fitting shapes to the whole clip")
+    followed = follow([f.second_pass(first.rgb) for f in passed], "following again, with the whole clip in mind")
 
     tracks: dict[str, ObjectTrack] = {}
-    for request, start, found in zip(requests, starts, estimates, strict=True):
+    for request, start, result in zip(requests, starts, followed, strict=True):
+        found = result.estimates
         visible = np.array([e.visible for e in found])
         if visible.mean() < 0.1:
             raise _not_found(request, info, f"it was lost after {int(visible.sum())} of {len(visible)} frames")
         confidence = np.array([e.confidence for e in found])
         raw = np.stack([e.T_camera_object for e in found])
-        time_s = np.asarray(times)
+        time_s = np.array([times[k] for k in range(len(found))])
+        model = start.model if result.vessel is None else _vessel_model(result.vessel)
         header = {
             "object": request.name,
-            "mesh": {**start.model.header, "symmetry": start.model.symmetry.to_json(), "up_axis": [0.0, 0.0, 1.0]},
+            "mesh": {**model.header, "symmetry": model.symmetry.to_json(), "up_axis": [0.0, 0.0, 1.0]},
             "image_size_px": [info.width_px, info.height_px],
             "video": {"file": info.path.name, "sha256": info.sha256},
             "camera": {"source": camera_source},
@@ -170,7 +179,7 @@ def extract(
         with atomic_path(out / f"{name}.mask.png") as temporary:
             cv2.imwrite(str(temporary), start.mask.astype(np.uint8) * 255)
     report(info.frame_count, info.frame_count, "drawing the overlay")
-    items = [OverlayItem(track, s.model.mesh) for track, s in zip(tracks.values(), starts, strict=True)]
+    items = [OverlayItem(track, f.mesh) for track, f in zip(tracks.values(), followed, strict=True)]
     write_overlay(info.path, items, out / "overlay.mp4")
     return tracks
 

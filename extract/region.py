@@ -84,6 +84,12 @@ class ColourModel:
         self.background = np.zeros((LOCAL_CENTRES + 1, BINS), np.float32)
         self.seen = np.zeros(LOCAL_CENTRES + 1, np.float32)
 
+    def copy(self) -> ColourModel:
+        """The model as it is now."""
+        twin = ColourModel()
+        twin.foreground, twin.background, twin.seen = self.foreground.copy(), self.background.copy(), self.seen.copy()
+        return twin
+
     def start_global(self, foreground: NDArray[np.int32], background: NDArray[np.int32]) -> None:
         """Set the global histograms (row LOCAL_CENTRES) from colour bins of labelled pixels."""
         for histogram, bins in ((self.foreground, foreground), (self.background, background)):

@@ -49,12 +49,12 @@ class ObjectTracker:
         if (outline := extract_outline(mesh, T_camera_object, camera_matrix, mask.shape)) is not None:
             self.colours.update(outline, mesh, bins, 1.0)
 
-    def step(self, rgb: Image) -> Estimate:
-        """Pose in the next frame."""
+    def step(self, rgb: Image, guess: Array | None = None) -> Estimate:
+        """Pose in the next frame, refined from `guess` or else from where the motion so far leads."""
         bins = colour_bins(rgb)
         strength = edge_strength(rgb)
-        best = self._refined(self._predicted(), bins, strength)
-        if best.confidence < LOST_BELOW:
+        best = self._refined(self._predicted() if guess is None else guess, bins, strength)
+        if best.confidence < LOST_BELOW and guess is None:
             # A wider search, from the prediction and from where the object was seen last.
             for start in (self._predicted(), self._pose):
                 wide = self._refined(start, bins, strength, SEARCH_STEPS_PX, freedom=3.0)
@@ -88,7 +88,7 @@ class ObjectTracker:
     ) -> Estimate:
         result = refine(
             self.mesh, start, self.camera_matrix, bins, self.colours, steps_px=steps_px,
-            prior_rotation_rad=0.15 * freedom, prior_translation=0.02 * freedom, prior_depth=0.01 * freedom,
+            prior_rotation_rad=0.03 * freedom, prior_translation=0.02 * freedom, prior_depth=0.01 * freedom,
             edges=strength if TRACK_EDGES else None,
         )  # fmt: skip
         T = result.T_camera_object

@@ -1,0 +1,144 @@
+"""Follow an object through a clip twice: once to see it from all sides, once knowing its shape and its turns.
+
+The first pass goes from frame to frame. Then, with glimpses from the whole clip at hand, the spin about the vessel's
+own axis is settled (spin.py) and the vessel's shape is fitted to several frames at once (shape_fit.py). The second
+pass refines every frame from the corrected pose, so that nothing is chained and nothing drifts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from .first_pose import edge_score
+from .geometry import Array, invert_pose
+from .raster import render_depth
+from .region import ColourModel, TrackingMesh, colour_bins, edge_strength
+from .segment import Mask
+from .shape_fit import View, fit_shape, tracking_mesh
+from .spin import best_spins, object_evidence, spin_scores, spun
+from .tracker import Estimate, ObjectTracker
+from .vessels import Vessel
+from .video import Image
+
+GLIMPSES = 60  # frames kept for the spin
+FIT_VIEWS = 6  # frames that the shape is fitted to
+SURE = 0.35  # least confidence of a frame that the shape may be fitted to
+
+
+@dataclass(frozen=True)
+class Glimpse:
+    """What is kept of a frame: half-size evidence of the object's colours and, for some, all a shape fit needs."""
+
+    index: int
+    evidence: NDArray[np.float32]
+    bins: NDArray[np.int32] | None
+    edges: NDArray[np.float32] | None
+    colours: ColourModel | None
+
+
+@dataclass
+class Followed:
+    """One object on its way through the clip."""
+
+    mesh: TrackingMesh
+    vessel: Vessel | None
+    camera_matrix: Array
+    first_mask: Mask
+    tracker: ObjectTracker
+    guesses: Array | None = None
+    estimates: list[Estimate] = field(default_factory=list)
+    glimpses: list[Glimpse] = field(default_factory=list)
+
+    @staticmethod
+    def start(
+        mesh: TrackingMesh,
+        vessel: Vessel | None,
+        camera_matrix: Array,
+        rgb: Image,
+        mask: Mask,
+        T_camera_object: Array,
+        guesses: Array | None = None,
+    ) -> Followed:
+        """Ready for the first frame, in which the object has the mask and the pose given."""
+        tracker = ObjectTracker(mesh, camera_matrix, rgb, mask, T_camera_object)
+        return Followed(mesh, vessel, camera_matrix, mask, tracker, guesses)
+
+    def step(self, rgb: Image, index: int, frame_count: int) -> None:
+        """Take the next frame."""
+        guess = None if self.guesses is None else self.guesses[min(index, len(self.guesses) - 1)]
+        self.estimates.append(self.tracker.step(rgb, guess))
+        stride = max(1, frame_count // GLIMPSES)
+        if self.guesses is None and self.vessel is not None and index % stride == 0:
+            bins, colours = colour_bins(rgb), self.tracker.colours
+            whole = len(self.glimpses) % max(1, GLIMPSES // (2 * FIT_VIEWS)) == 0
+            self.glimpses.append(
+                Glimpse(
+                    index,
+                    object_evidence(bins, colours)[::2, ::2],
+                    bins if whole else None,
+                    edge_strength(rgb) if whole else None,
+                    colours.copy() if whole else None,
+                )
+            )
+
+    def second_pass(self, first_rgb: Image) -> Followed:
+        """The same object before the first frame again, with spin and shape settled."""
+        poses = np.stack([e.T_camera_object for e in self.estimates])
+        mesh, vessel = self.mesh, self.vessel
+        if vessel is not None:
+            if vessel.symmetry.order != 0 and len(self.glimpses) > 1:
+                poses = self._with_settled_spin(poses, vessel)
+            vessel, shift = self._fitted(poses, vessel)
+            if vessel is not self.vessel:
+                mesh, poses = tracking_mesh(vessel), poses @ shift
+        return Followed.start(mesh, vessel, self.camera_matrix, first_rgb, self.first_mask, poses[0], poses)
+
+    def _with_settled_spin(self, poses: Array, vessel: Vessel) -> Array:
+        axis = vessel.interior.axis_xy_m
+        camera = np.diag([0.5, 0.5, 1.0]) @ self.camera_matrix
+        light = tracking_mesh(vessel, 3000)
+        scores = [spin_scores(light, poses[g.index], camera, g.evidence, axis) for g in self.glimpses]
+        angles = best_spins(np.stack(scores))
+        every = np.interp(np.arange(len(poses)), [g.index for g in self.glimpses], angles)
+        return np.stack([spun(T, angle, axis) for T, angle in zip(poses, every, strict=True)])
+
+    def _fitted(self, poses: Array, vessel: Vessel) -> tuple[Vessel, Array]:
+        """The vessel fitted to several frames, and the pose of its frame in the old one's; unchanged if no better."""
+        kept = [g for g in self.glimpses if g.bins is not None and self.estimates[g.index].confidence > SURE]
+        if not kept:
+            return vessel, np.eye(4)
+        chosen = [kept[k] for k in np.unique(np.linspace(0, len(kept) - 1, FIT_VIEWS).round().astype(int))]
+        views = [
+            View(g.bins, g.colours, poses[g.index], None, g.edges)
+            for g in chosen
+            if g.bins is not None and g.colours is not None
+        ]
+        fitted, fitted_poses = fit_shape(vessel, views, self.camera_matrix)
+        before = self._merit(tracking_mesh(vessel), [v.T_camera_object for v in views], chosen)
+        after = self._merit(tracking_mesh(fitted), fitted_poses, chosen)
+        if after <= before:
+            return vessel, np.eye(4)
+        shifts = np.stack([invert_pose(v.T_camera_object) @ T for v, T in zip(views, fitted_poses, strict=True)])
+        shift = np.eye(4)
+        shift[:3, :3] = Rotation.from_matrix(shifts[:, :3, :3]).mean().as_matrix()
+        shift[:3, 3] = np.median(shifts[:, :3, 3], axis=0)
+        return fitted, shift
+
+    def _merit(self, mesh: TrackingMesh, poses: list[Array], glimpses: list[Glimpse]) -> float:
+        """Mean over the views of the share of object colours covered and of the outline on image edges."""
+        total = 0.0
+        half = np.diag([0.5, 0.5, 1.0]) @ self.camera_matrix
+        for T, glimpse in zip(poses, glimpses, strict=True):
+            if glimpse.edges is None:
+                continue
+            total += edge_score(mesh, T, self.camera_matrix, glimpse.edges)
+            window = render_depth(mesh.vertices_m, mesh.faces, T, half)
+            if window is not None:
+                silhouette = window.mask_in_image(glimpse.evidence.shape[1], glimpse.evidence.shape[0])
+                most = float(np.maximum(glimpse.evidence, 0)[silhouette].sum())
+                total += float(glimpse.evidence[silhouette].sum()) / max(most, 1.0)
+        return total / len(glimpses)
