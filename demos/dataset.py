@@ -154,6 +154,9 @@ def _write_dataset(
         use_videos=True,
         rgb_encoder=RGBEncoderConfig(**ENCODER, extra_options=dict(ENCODER_EXTRA)),
     )
+    if not hasattr(dataset.writer, "_streaming_encoder"):
+        # Otherwise LeRobot would encode the blank frames it is given below.
+        raise UserError("this version of lerobot keeps its encoder elsewhere; install lerobot==0.6.1")
     videos = _EncodedVideos(root)
     dataset.writer._streaming_encoder = videos
     records = []
