@@ -126,11 +126,8 @@ def count_particles(
     Poured: inside the receptacle's hollow. Held: inside the vessel's. Spilled: in neither and below the receptacle's
     rim, from where nothing finds back. The rest is in flight.
     """
-    if len(points_m) == 0:
-        nothing = np.zeros(0, bool)
-        return Count(nothing, nothing, nothing)
-    poured = receptacle.contains((points_m - T_world_receptacle[:3, 3]) @ T_world_receptacle[:3, :3])
-    held = vessel.contains((points_m - T_world_vessel[:3, 3]) @ T_world_vessel[:3, :3]) & ~poured
+    poured = receptacle.contains(points_m, T_world_receptacle)
+    held = vessel.contains(points_m, T_world_vessel) & ~poured
     rim = np.array([*receptacle.axis_xy_m, receptacle.rim_m])
     rim_z = float((T_world_receptacle[:3, :3] @ rim + T_world_receptacle[:3, 3])[2])
     return Count(held, poured, ~poured & ~held & (points_m[:, 2] < rim_z))

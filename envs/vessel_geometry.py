@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -29,6 +30,7 @@ WALL_M, RIM_WALL_M, PLATE_M = 0.008, 0.006, 0.015
 # Strips shorter than a particle would only add edges for it to be squeezed between.
 MIN_STRIP_M = 0.01
 WIDE_RADIUS_M = 0.045
+_IDENTITY = np.eye(4)
 
 
 @dataclass(frozen=True)
@@ -73,9 +75,29 @@ class Cavity:
         side = np.min(support - (points_m[:, :2] - self.axis_xy_m) @ self.normals.T, axis=1)
         return np.asarray(np.minimum(side, np.minimum(z - self.z_m[0], self.z_m[-1] - z)))
 
-    def contains(self, points_m: Array) -> NDArray[np.bool_]:
-        """(N,) whether points (N, 3) lie in the hollow."""
-        return np.asarray(self.clearance_m(points_m) >= 0.0)
+    def contains(self, points_m: Array, T: Array = _IDENTITY) -> NDArray[np.bool_]:
+        """(N,) whether points (N, 3) lie in the hollow of a vessel at pose T (4, 4) in the points' frame."""
+        normals, offsets = self._planes
+        R, t = T[:3, :3], T[:3, 3]
+        # The planes go to the points, not the points to the planes: there are fewer of them to turn.
+        turned = R @ normals
+        frusta = len(self.z_m) - 1
+        beyond = (
+            (points_m @ turned - (offsets + t @ turned)).reshape(len(points_m), frusta, len(self.normals)).max(axis=2)
+        )
+        z = (points_m - t) @ R[:, 2]
+        level = np.searchsorted(self.z_m, z) - 1
+        within = (level >= 0) & (level < frusta)
+        return np.asarray(within & (beyond[np.arange(len(z)), np.where(within, level, 0)] <= 0.0))
+
+    @cached_property
+    def _planes(self) -> tuple[Array, Array]:
+        """Normals (3, F n) and offsets (F n) of the wall's planes: a point is inside where normal . point <= offset."""
+        slope = np.diff(self.support_m, axis=0) / np.diff(self.z_m)[:, None]
+        flat = np.broadcast_to(self.normals, (*slope.shape, 2))
+        normals = np.concatenate([flat, -slope[..., None]], axis=2)
+        offsets = self.support_m[:-1] - slope * self.z_m[:-1, None] + self.normals @ self.axis_xy_m
+        return np.ascontiguousarray(normals.reshape(-1, 3).T), offsets.ravel()
 
     @property
     def rim_m(self) -> float:

@@ -15,7 +15,7 @@ from gymnasium.utils.env_checker import check_env
 from vid2demo.envs.builtin import pour_reference
 from vid2demo.envs.liquid import Liquid
 from vid2demo.envs.panda import DQ_MAX_RAD_S, Q_MAX_RAD, Q_MIN_RAD
-from vid2demo.envs.pouring import PandaPourEnv
+from vid2demo.envs.pouring import PandaPourEnv, PhysicsError
 from vid2demo.envs.randomization import Randomization
 from vid2demo.envs.reference import Reference
 from vid2demo.extract.errors import UserError
@@ -239,6 +239,41 @@ def test_joint_targets_keep_speed_and_position_limits(mug_pour: Reference) -> No
             assert np.all(env._target <= Q_MAX_RAD)
             previous = env._target
     assert np.all(np.isfinite(env.data.qpos))
+
+
+@pytest.mark.parametrize("control_mode", ["joint_position", "joint_delta"])
+def test_random_actions_leave_everything_finite(mug_pour: Reference, control_mode: str) -> None:
+    env = PandaPourEnv(mug_pour, num_particles=FEW, control_mode=control_mode)
+    env.action_space.seed(0)
+    for seed in range(3):
+        env.reset(seed=seed)
+        for _ in range(100):
+            observation, reward, _, _, _ = env.step(env.action_space.sample())
+            assert np.isfinite(reward)
+            assert all(np.all(np.isfinite(values)) for values in observation.values())
+
+
+def test_the_arm_cannot_go_through_the_table(mug_pour: Reference) -> None:
+    env = PandaPourEnv(mug_pour, num_particles=0)
+    env.reset(seed=0)
+    down = np.array([0.0, 1.4, 0.0, -1.2, 0.0, 2.4, 0.785], np.float32)
+    for _ in range(80):
+        env.step(down)
+    ideal = mujoco.MjData(env.model)
+    ideal.qpos[:7] = down
+    mujoco.mj_kinematics(env.model, ideal)
+    assert ideal.body("panda_leftfinger").xpos[2] < -0.02, "the command would lead into the table"
+    assert env.data.body("panda_leftfinger").xpos[2] > 0.0
+
+
+def test_a_diverged_simulation_is_reported_with_seed_and_step(mug_pour: Reference, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes its warning to a log file here
+    env = PandaPourEnv(mug_pour, num_particles=0)
+    env.reset(seed=5)
+    env.step(mug_pour.q_start_rad)
+    env.data.qvel[3] = np.nan
+    with pytest.raises(PhysicsError, match="step 2 of the episode with seed 5"):
+        env.step(mug_pour.q_start_rad)
 
 
 @pytest.mark.parametrize("action", [np.zeros(6), np.full(7, np.nan)])

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from vid2demo.envs.scene import build_scene
 from vid2demo.envs.vessel_geometry import (
     Cavity,
@@ -26,6 +27,15 @@ def test_hollow_knows_its_inside(cylinder: Cavity) -> None:
     points = np.array([[0.01, 0, 0], [0.0499, 0, 0], [0.0501, 0, 0], [0.01, 0, 0.0501], [0.01, 0, -0.0501]])
     np.testing.assert_array_equal(cylinder.contains(points), [True, True, False, False, False])
     np.testing.assert_allclose(cylinder.clearance_m(points[:1]), 0.04)
+
+
+def test_inside_agrees_with_clearance_in_any_pose() -> None:
+    cavity = cavity_of(make_vessel("carton"))
+    T = make_pose(Rotation.from_euler("xyz", [0.4, -1.2, 2.0]).as_matrix(), (0.3, -0.2, 0.5))
+    local = np.random.default_rng(0).uniform(-0.1, 0.1, (5000, 3))
+    inside = cavity.contains(local @ T[:3, :3].T + T[:3, 3], T)
+    np.testing.assert_array_equal(inside, cavity.clearance_m(local) >= 0)
+    assert 200 < np.count_nonzero(inside) < 4800
 
 
 def test_volume_of_a_prism_and_of_a_pyramid_is_exact(cylinder: Cavity) -> None:
