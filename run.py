@@ -11,7 +11,7 @@ from typing import Any, Literal
 from .extract.errors import UserError
 from .extract.files import sha256_of_file, write_json
 from .extract.progress import Listener, Progress
-from .extract.stages import PACKAGE_ROOT, Stage, plain, run_stages
+from .extract.stages import PACKAGE_ROOT, Stage, StageError, plain, run_stages
 
 _ALL = ("extract", "envs", "demos")
 
@@ -265,16 +265,27 @@ def stages_of(settings: RunSettings, folder: Path) -> list[Stage]:
 def run(
     settings: RunSettings, folder: Path, *, force: bool = False, listener: Listener | None = None
 ) -> dict[str, Any]:
-    """The whole way from a video to a dataset and a report. Returns the content of `run.json`."""
-    return run_stages(
-        folder,
-        stages_of(settings, folder),
-        command="run",
-        settings=settings_record(settings),
-        video=video_identity(settings.video),
-        force=force,
-        listener=listener,
-    )
+    """The whole way from a video to a dataset and a report. Returns the content of `run.json`.
+
+    Raises UserError for bad input. When the robot cannot do what the video shows, the report is written all the same.
+    """
+    try:
+        return run_stages(
+            folder,
+            stages_of(settings, folder),
+            command="run",
+            settings=settings_record(settings),
+            video=video_identity(settings.video),
+            force=force,
+            listener=listener,
+        )
+    except StageError as error:
+        if error.stage in ("extract", "report"):
+            raise
+        # What was done shows why it went no further, better than a sentence can.
+        from .report import write_report
+
+        raise UserError(f"{error}; what was done so far is in {write_report(folder)}") from error
 
 
 def _stem(path: Path) -> str:

@@ -47,6 +47,14 @@ _PACKAGES = (
 )
 
 
+class StageError(UserError):
+    """Bad input that a stage met at work; `stage` is its name. The stages before it are done."""
+
+    def __init__(self, stage: str, message: str) -> None:
+        super().__init__(message)
+        self.stage = stage
+
+
 @dataclass(frozen=True)
 class Stage:
     """One step of a run.
@@ -149,7 +157,8 @@ def run_stages(
     command, settings: recorded for the reader of `run.json`.
     video: {"path", "sha256"} of the video that the folder belongs to, where there is one.
     force: do every stage again.
-    Raises UserError when the folder belongs to another video, is no folder, or another process is at work in it.
+    Raises UserError when the folder belongs to another video, is no folder, or another process is at work in it, and
+    StageError when a stage refuses its input.
     """
     listener = listener or Listener()
     if folder.exists() and not folder.is_dir():
@@ -179,8 +188,10 @@ def run_stages(
             begin_s = time.perf_counter()
             try:
                 figures = stage.work(listener.progress)
-            except BaseException:
+            except BaseException as error:
                 listener.failed(stage.title)
+                if isinstance(error, UserError):
+                    raise StageError(stage.name, str(error)) from error
                 raise
             seconds = time.perf_counter() - begin_s
             record["stages"][stage.name] = {

@@ -1,9 +1,16 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
+from vid2demo.extract.errors import UserError
+from vid2demo.extract.progress import Progress
+from vid2demo.extract.stages import Stage
+from vid2demo.extract.video import VideoWriter
 from vid2demo.run import (
     ObjectSettings,
     RunSettings,
@@ -11,6 +18,7 @@ from vid2demo.run import (
     extract_stage,
     joints_path,
     reference_path,
+    run,
     settings_record,
     stages_of,
 )
@@ -95,3 +103,26 @@ def test_settings_are_recorded_as_json_knows_them() -> None:
     assert record["video"] == "coffee.mp4"
     assert record["object"]["box_xywh_px"] == [1, 2, 3, 4]
     assert record["seed"] == 0
+
+
+def test_a_robot_that_cannot_do_it_leaves_a_report_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def follow(progress: Progress) -> Mapping[str, Any]:
+        (tmp_path / "out/kettle.track.npz").write_bytes(b"seen")
+        return {}
+
+    def refuse(progress: Progress) -> Mapping[str, Any]:
+        raise UserError("out of reach by 0.3 m; try --scale 0.7")
+
+    def short(settings: RunSettings, folder: Path) -> list[Stage]:
+        return [Stage("extract", "", follow, outputs=("kettle.track.npz",)), Stage("reference", "", refuse)]
+
+    video = tmp_path / "coffee.mp4"
+    with VideoWriter(video, 25.0) as writer:
+        for _ in range(2):
+            writer.write(np.full((64, 64, 3), 80, np.uint8))
+    monkeypatch.setattr("vid2demo.run.stages_of", short)
+    with pytest.raises(UserError, match=r"try --scale 0\.7; what was done so far is in .*report\.html"):
+        run(dataclasses.replace(KETTLE, video=video), tmp_path / "out")
+    assert (tmp_path / "out/report.html").is_file()

@@ -17,7 +17,7 @@ import pytest
 from vid2demo.extract.errors import UserError
 from vid2demo.extract.files import write_text
 from vid2demo.extract.progress import Listener, Progress
-from vid2demo.extract.stages import Stage, content_hash, plain, read_run, run_stages
+from vid2demo.extract.stages import Stage, StageError, content_hash, plain, read_run, run_stages
 
 
 class Recorder(Listener):
@@ -144,6 +144,17 @@ def test_failure_keeps_what_was_done_and_the_next_run_goes_on_there(tmp_path: Pa
     assert list(record["stages"]) == NAMES[:1]
     resumed = go(folder, stages)
     assert (resumed.skipped_names, resumed.done) == (NAMES[:1], NAMES[1:])
+
+
+def test_refused_input_names_its_stage_and_keeps_what_was_done(tmp_path: Path, source: Path) -> None:
+    def refuse(text: str) -> str:
+        raise UserError("the tea is cold; heat it")
+
+    stages = [*chain(tmp_path, source)[:1], copy_stage(tmp_path, source, "twice.txt", refuse)]
+    with pytest.raises(StageError, match="the tea is cold; heat it") as caught:
+        go(tmp_path, stages)
+    assert caught.value.stage == NAMES[1]
+    assert go(tmp_path, chain(tmp_path, source)).skipped_names == NAMES[:1]
 
 
 def test_process_killed_in_a_stage_leaves_a_folder_that_goes_on(tmp_path: Path) -> None:
