@@ -28,10 +28,9 @@ from .vessel_shapes import (
 )
 from .vessel_types import Color, GraspRegion, Outlet, Profile, Section, Vessel
 
-STEEL_KG_M3, ALUMINIUM_KG_M3, CERAMIC_KG_M3, GLASS_KG_M3, PLASTIC_KG_M3, CARD_KG_M3 = 7900, 2700, 2300, 2500, 1000, 800
+STEEL_KG_M3, CERAMIC_KG_M3, GLASS_KG_M3, PLASTIC_KG_M3, CARD_KG_M3 = 7900.0, 2300.0, 2500.0, 1000.0, 800.0
 BLACK: Color = (0.07, 0.07, 0.07, 1.0)
 STEEL: Color = (0.74, 0.75, 0.77, 1.0)
-WOOD: Color = (0.55, 0.36, 0.20, 1.0)
 
 # The cavity is cut a little beyond the rim so that no face of it coincides with the rim's.
 OVERCUT_M = 0.002

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -161,7 +161,7 @@ class Vessel:
     interior, exterior: inner and outer surface of the wall; a pulled-out pouring lip is left out of both.
     wall_m: thickness of the wall. is_open: False when a lid closes the top and only the spout pours.
     interior_volume_m3: volume from floor to rim (or lid), lip included, spout channel left out.
-    mass_kg: of the empty vessel.
+    mass_kg: of the empty vessel. color_rgba: of its body. extents_m: full size of its bounding box along x, y, z.
     """
 
     category: str
@@ -178,4 +178,4 @@ class Vessel:
     interior_volume_m3: float
     mass_kg: float
     color_rgba: Color
-    extents_m: Vector = field(default=(0.0, 0.0, 0.0))
+    extents_m: Vector

@@ -15,7 +15,7 @@ from vid2demo.extract.vessel_shapes import Solid, stacked_rings
 from vid2demo.extract.vessel_types import Profile, Section
 from vid2demo.extract.vessels import CATEGORIES, Vessel, _build, make_vessel, parameter_space, resolve_category
 
-SEEDS = (None, 0, 1)
+SEEDS = (None, 1)
 every_vessel = pytest.mark.parametrize(
     ("category", "seed"), [(c, s) for c in CATEGORIES for s in SEEDS], ids=lambda v: str(v)
 )
@@ -233,7 +233,7 @@ def test_equal_seeds_and_parameters_rebuild_the_same_mesh(category):
     assert mesh_sha256(make_vessel(category, 8).mesh) != mesh_sha256(first.mesh)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(st.data())
 def test_any_parameters_within_the_ranges_give_a_solid(data):
     category = data.draw(st.sampled_from(CATEGORIES))
