@@ -123,14 +123,19 @@ def count_particles(
 ) -> Count:
     """Sort particles at (N, 3) in the world.
 
-    Poured: inside the receptacle's hollow. Held: inside the vessel's. Spilled: in neither and below the receptacle's
-    rim, from where nothing finds back. The rest is in flight.
+    Held: inside the vessel's hollow. Poured: otherwise, inside the receptacle's. Spilled: in neither and below the
+    receptacle's rim, from where nothing finds back. The rest is in flight.
     """
-    poured = receptacle.contains(points_m, T_world_receptacle)
-    held = vessel.contains(points_m, T_world_vessel) & ~poured
+    held = vessel.contains(points_m, T_world_vessel)
+    poured, spilled = np.zeros_like(held), np.zeros_like(held)
+    out = np.flatnonzero(~held)
+    if len(out) == 0:
+        return Count(held, poured, spilled)
+    poured[out] = receptacle.contains(points_m[out], T_world_receptacle)
     rim = np.array([*receptacle.axis_xy_m, receptacle.rim_m])
     rim_z = float((T_world_receptacle[:3, :3] @ rim + T_world_receptacle[:3, 3])[2])
-    return Count(held, poured, ~poured & ~held & (points_m[:, 2] < rim_z))
+    spilled[out] = ~poured[out] & (points_m[out, 2] < rim_z)
+    return Count(held, poured, spilled)
 
 
 class SpoutConduit:
