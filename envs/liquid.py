@@ -36,11 +36,14 @@ class Liquid:
         not more than half of the receptacle: ten millilitres at the bottom of a kettle would never reach its spout.
     particle_mass_kg: mass of one particle.
     drag_kg_s: resistance of the air, so that what was spilled comes to rest at last.
+    spout_fill: share of a spouted vessel's hollow that the particles stand for while its level is sought; their own
+        volume where that is more. A few particles in a kettle behave as the kettle filled so far would.
     """
 
     radius_m: float | None = None
     particle_mass_kg: float = 0.0005
     drag_kg_s: float = 0.0001
+    spout_fill: float = 0.25
 
     def __post_init__(self) -> None:
         if self.radius_m is not None and not 0.002 <= self.radius_m <= 0.01:
@@ -49,6 +52,8 @@ class Liquid:
             raise UserError(f"liquid particle_mass_kg is {self.particle_mass_kg}; choose 1e-5 to 0.05 kg")
         if not 0.0 <= self.drag_kg_s <= 0.01:
             raise UserError(f"liquid drag_kg_s is {self.drag_kg_s}; choose 0 to 0.01 kg/s")
+        if not 0.0 <= self.spout_fill <= 0.9:
+            raise UserError(f"liquid spout_fill is {self.spout_fill}; choose 0 to 0.9")
 
     def radius_for(self, count: int, vessel_m3: float, receptacle_m3: float, throat_m: float) -> float:
         """The radius in m that `count` particles take in a vessel and a receptacle of these volumes.
@@ -60,6 +65,11 @@ class Liquid:
         share_m3 = min(0.25 * vessel_m3, 0.5 * receptacle_m3) * PACKING / max(count, 1)
         radius_m = min((share_m3 / (4 / 3 * math.pi)) ** (1 / 3), 0.22 * throat_m)
         return float(np.clip(radius_m, MIN_RADIUS_M, MAX_RADIUS_M))
+
+
+def level_share(liquid: Liquid, cavity: Cavity, count: int, radius_m: float) -> float:
+    """Share of the hollow's volume that one of `count` particles stands for."""
+    return max(4 / 3 * math.pi * radius_m**3 / PACKING / cavity.volume_m3, liquid.spout_fill / count)
 
 
 def fill_positions(cavity: Cavity, boxes: list[Box], count: int, radius_m: float, name: str) -> Array:
@@ -143,12 +153,14 @@ class SpoutConduit:
 
     Real spouts are as narrow as a particle, which would jam in them. So the body is closed, and while the liquid's
     level stands above both the channel's entry and the tip, the particle nearest the entry reappears at the tip,
-    moving along the outlet. The level is that of a liquid of the held particles' volume in the vessel as it is tilted
-    now. A particle leaves only when its place at the tip is clear: that limits the rate, keeps particles apart, and
-    makes the conduit a function of the physics state alone, so that replays and restored states agree bit by bit.
+    moving along the outlet. The level is that of the liquid that the held particles stand for (`Liquid.spout_fill`) in
+    the vessel as it is tilted now. A particle leaves only when its place at the tip is clear: that limits the rate,
+    keeps particles apart, and makes the conduit a function of the physics state alone, so that replays and restored
+    states agree bit by bit.
     """
 
-    def __init__(self, vessel: Vessel, cavity: Cavity, radius_m: float) -> None:
+    def __init__(self, vessel: Vessel, cavity: Cavity, radius_m: float, share: float) -> None:
+        """share: of the hollow's volume that one particle stands for."""
         outlet = vessel.outlet
         if outlet.entry_m is None:
             raise UserError(f"the {vessel.category}'s spout names no entry; rebuild the vessel with its channel")
@@ -157,7 +169,7 @@ class SpoutConduit:
         self._direction = np.asarray(outlet.direction, float)
         self._slots_m = self._tip_m + radius_m * self._direction + self._slots(float(outlet.tip_radius_m or 0.0))
         self._samples_m = cavity.sample(LEVEL_SAMPLES)
-        self._volume_share = 4 / 3 * math.pi * radius_m**3 / PACKING / cavity.volume_m3
+        self._share = share
 
     def _slots(self, tip_radius_m: float) -> Array:
         """(S, 3) places side by side in the tip's mouth: one, or seven when it is wide enough."""
@@ -172,11 +184,11 @@ class SpoutConduit:
         return np.vstack([np.zeros((1, 3)), ring_m * (np.cos(angle) * u + np.sin(angle) * v)])
 
     def level_m(self, T_world_vessel: Array, held: int) -> float:
-        """Height in the world of the surface of a liquid of `held` particles' volume; -inf when there is none."""
+        """Height in the world of the surface of the liquid that `held` particles stand for; -inf when there is none."""
         if held == 0:
             return -math.inf
         heights = self._samples_m @ T_world_vessel[2, :3]
-        rank = min(len(heights) - 1, int(held * self._volume_share * len(heights)))
+        rank = min(len(heights) - 1, int(held * self._share * len(heights)))
         return float(np.partition(heights, rank)[rank] + T_world_vessel[2, 3])
 
     def may_flow(self, T_world_vessel: Array, points_m: Array) -> bool:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ..extract.errors import UserError
 from ..extract.geometry import Array, make_pose
 from . import observations
-from .liquid import Count, Liquid, SpoutConduit, count_particles, fill_positions
+from .liquid import Count, Liquid, SpoutConduit, count_particles, fill_positions, level_share
 from .options import (
     check_cameras,
     check_number,
@@ -279,8 +279,13 @@ class PandaPourEnv(gym.Env[Observation, NDArray[np.float32]]):
         self._twist: Array = np.zeros(6)
         self._fractions = (np.arange(1, self._substeps + 1) / self._substeps)[:, None]
         self._gripper_m = gripper_half_width_m(scene.vessel, self._base.T_hand_object)
-        spout = scene.vessel.outlet.kind == "spout" and scene.num_particles > 0
-        self._conduit = SpoutConduit(scene.vessel, scene.vessel_cavity, scene.radius_m) if spout else None
+        self._conduit = self._make_conduit(scene) if scene.vessel.outlet.kind == "spout" else None
+
+    def _make_conduit(self, scene: Scene) -> SpoutConduit | None:
+        if scene.num_particles == 0:
+            return None
+        share = level_share(scene.liquid, scene.vessel_cavity, scene.num_particles, scene.radius_m)
+        return SpoutConduit(scene.vessel, scene.vessel_cavity, scene.radius_m, share)
 
     def _settle(self) -> tuple[Array, int]:
         """(N, 3) resting places of the particles in the vessel's frame, and how many stay inside it."""

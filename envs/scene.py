@@ -51,6 +51,7 @@ class Scene:
     T_world_receptacle: Array
     num_particles: int
     radius_m: float
+    liquid: Liquid
 
 
 def build_scene(reference: Reference, num_particles: int, liquid: Liquid, timestep_s: float) -> Scene:
@@ -93,6 +94,7 @@ def build_scene(reference: Reference, num_particles: int, liquid: Liquid, timest
         T_world_receptacle,
         num_particles,
         radius_m,
+        liquid,
     )
 
 
@@ -274,10 +276,12 @@ def _add_cameras(spec: mujoco.MjSpec, reference: Reference, vessel: Vessel, T_wo
             spec.worldbody, name, look_at(target + reach * distance_m * away, target, np.array([0, 0, 1.0])), fovy_deg
         )
 
-    # On the wrist: above the hand on the side to which the vessel opens, looking between mouth and outlet.
+    # On the wrist: beside the hand on the side to which the vessel opens, or, when the hand holds it from above, on
+    # the side of its outlet; looking between mouth and outlet.
     T = reference.T_hand_object
-    upward = T[:3, 2] * np.array([1.0, 1.0, 0.0])
-    upward = upward / np.linalg.norm(upward) if np.linalg.norm(upward) > 0.3 else np.array([1.0, 0.0, 0.0])
+    sideways = np.array([1.0, 1.0, 0.0])
+    upward = sideways * (T[:3, 2] if np.linalg.norm(T[:2, 2]) > 0.3 else T[:3, 0])
+    upward = upward / np.linalg.norm(upward)
     mouth, lip = transform_points(T, np.array([[0.0, 0.0, vessel.extents_m[2] / 2], vessel.outlet.point_m]))
     middle, spread_m = (mouth + lip) / 2, float(np.linalg.norm(mouth - lip))
     eye = np.array([0.0, 0.0, -0.09]) + upward * (max(float(mouth @ upward), float(lip @ upward), 0.0) + 0.11)
