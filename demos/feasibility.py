@@ -76,7 +76,8 @@ def _problems(findings: dict[str, Any], margin: Array, speed_part: Array, torque
         if part.max() > 1.0 + 1e-6:
             problems.append(f"joint {int(part.argmax()) + 1} exceeds its {kind} limit")
     problems += [
-        f"the {c['first']} touches the {c['second']} around {c['time_s']:.1f} s" for c in findings["collisions"]
+        f"the {c['first']} touches the {c['second']} around {c['video_time_s']:.1f} s of the video"
+        for c in findings["collisions"]
     ]
     return problems
 
@@ -104,7 +105,7 @@ def _words(findings: dict[str, Any], problems: list[str]) -> list[str]:
     ]
     if tightest["value"] < _TIGHT_RAD:
         words.append("That is tight: a small change of the motion may not be possible.")
-    if findings["time_stretch"] > 1.0:
+    if findings["time_stretch"] > 1.01:
         words.append(f"The robot takes {findings['time_stretch']:.2f} times as long as the human.")
     if findings["scale"] == 1.0:
         words.append("The path has the size seen in the video.")

@@ -17,19 +17,17 @@ from ..extract.geometry import Array, angle_between_rad, invert_pose, make_pose
 from ..extract.track import ObjectTrack
 from .grasps import MAX_WIDTH_M
 from .jet import filling_m3, jet_of, tilt_rad
-from .panda import DQ_MAX_RAD_S
 from .placement_search import Placement, Shortfall, Stage, search_placement
 from .receptacle import bottom_m, place_receptacle, receptacle_pose_at_pour, surface_points
 from .reference import Reference, vessel_from_header, vessel_to_header
 from .resampling import ResampledTrack, resample_track
+from .retiming import slowed
 
 if TYPE_CHECKING:
     from ..extract.vessels import Vessel
 
 MIN_SCALE = 0.3
 DEFAULT_RECEPTACLE = "bowl"
-# Part of the joint speed limits that the reference may ask for: the rest is for the controller.
-SPEED_PART = 0.8
 _STILL_RAD, _STILL_S = np.deg2rad(5.0), 0.8
 _SAME_TABLE_M = 0.08
 # The receptacle is taken from where it was while the tilt was above this part of its greatest value.
@@ -100,7 +98,8 @@ def build_reference(
             f"{100 * MAX_WIDTH_M:.1f} cm: it can be held in simulation only."
         )
     notes += [
-        f"Around {stage.time_s[c.knot]:.1f} s the {c.first} touches the {c.second} ({1000 * c.depth_m:.0f} mm deep)."
+        f"Around {resampled.video_time_s[c.knot]:.1f} s of the video the {c.first} touches the {c.second} "
+        f"({1000 * c.depth_m:.0f} mm deep)."
         for c in placement.collisions
     ]
     T_world_object = placement.T_world_stage @ stage.T_object
@@ -130,14 +129,19 @@ def build_reference(
         "notes": notes,
         "feasibility": {
             "collisions": [
-                {"first": c.first, "second": c.second, "time_s": float(stage.time_s[c.knot]), "depth_m": c.depth_m}
+                {
+                    "first": c.first,
+                    "second": c.second,
+                    "video_time_s": float(resampled.video_time_s[c.knot]),
+                    "depth_m": c.depth_m,
+                }
                 for c in placement.collisions
             ],
             "caught_part_of_jet": caught,
         },
     }
     reference = Reference.from_poses(T_world_object, stage.time_s, header, resampled.confidence, resampled.video_time_s)
-    return _slowed(reference, placement.q_rad, control_hz)
+    return slowed(reference, placement.q_rad)
 
 
 def _receptacle_of(track: ObjectTrack | None) -> Vessel:
@@ -326,16 +330,6 @@ def _camera_pose(T_world_stage: Array, stage: Stage, seen: _Seen) -> Array:
     deepest = int(np.argmax(tilt_rad(stage.T_object)))
     up_camera = make_pose(seen.R_up_camera, stage.T_object[deepest, :3, 3] - seen.T_object[deepest, :3, 3])
     return np.asarray(T_world_stage @ up_camera)
-
-
-def _slowed(reference: Reference, q_rad: Array, control_hz: float) -> Reference:
-    """Stretch time uniformly where the arm would have to exceed its joint speeds."""
-    ratio = float((np.abs(np.gradient(q_rad, 1.0 / control_hz, axis=0)) / DQ_MAX_RAD_S).max()) / SPEED_PART
-    if ratio <= 1.0:
-        return reference
-    slower = reference.stretched(ratio)
-    note = f"The human moves faster than the arm may: the motion was slowed down by a factor of {ratio:.2f}."
-    return slower.with_header(notes=[*reference.notes, note])
 
 
 def _given(value: Array | None) -> Array:

@@ -195,13 +195,20 @@ class Reference:
         if factor == 1.0:
             return self
         knots = max(2, round(self.duration_s * factor * self.control_hz) + 1)
-        position = np.linspace(0.0, self.duration_s, knots) + self.time_s[0]
-        T = spline_poses(self.T_world_object, self.time_s, position)
-        header = {**self.header, "time_stretch": float(self.header.get("time_stretch", 1.0)) * factor}
+        return self.retimed(np.arange(knots, dtype=np.float64) * (self.duration_s / (knots - 1)))
+
+    def retimed(self, at_s: Array) -> Reference:
+        """The same path on a new clock: knot k (same rate) is where this one is `at_s[k]` after its start.
+
+        at_s: (M,) s, not decreasing, inside the duration. `time_stretch` is multiplied by new over old duration.
+        """
+        position = self.time_s[0] + np.asarray(at_s, float)
+        time_s = np.arange(len(position)) / self.control_hz
+        factor = float(time_s[-1]) / self.duration_s
         return Reference.from_poses(
-            T,
-            np.arange(knots) / self.control_hz,
-            header,
+            spline_poses(self.T_world_object, self.time_s, position),
+            time_s,
+            {**self.header, "time_stretch": float(self.header.get("time_stretch", 1.0)) * factor},
             np.interp(position, self.time_s, self.confidence),
             np.interp(position, self.time_s, self.video_time_s),
         )

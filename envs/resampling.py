@@ -10,6 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial.transform import Rotation
 
 from ..extract.errors import UserError
 from ..extract.geometry import Array, rotation_angle_rad
@@ -23,7 +25,10 @@ MIN_DURATION_S = 0.3
 MAX_TRAVEL_M = 5.0
 # A hand does not move a vessel faster; a tracker that loses it does.
 JUMP_M_S, JUMP_RAD_S, JUMP_FRAMES = 4.0, 20.0, 6
-_STILL_M_S, _STILL_RAD_S = 0.04, 0.2
+# Second differences at the control rate (rms) below which jitter is nothing the arm would show.
+JITTER_M, JITTER_RAD = 0.0003, np.deg2rad(0.15)
+SMOOTHING_S = (0.0, 0.03, 0.05, 0.08, 0.12, 0.16)
+_STILL_M_S, _STILL_RAD_S, _HEAD_S = 0.04, 0.2, 0.3
 
 
 @dataclass(frozen=True)
@@ -76,9 +81,9 @@ def resample_track(
         )
     video_time_s = _video_clock(T, time_s, control_hz, hold_s, ease_s, notes)
     confidence = np.where(good, track.confidence[inside], 0.0)
-    return ResampledTrack(
-        spline_poses(T, time_s, video_time_s), video_time_s, np.interp(video_time_s, time_s, confidence), notes
-    )
+    sure = np.interp(video_time_s, time_s, confidence)
+    poses = _without_jitter(spline_poses(T, time_s, video_time_s), sure, control_hz, notes)
+    return ResampledTrack(poses, video_time_s, sure, notes)
 
 
 def _check_units(track: ObjectTrack) -> None:
@@ -148,14 +153,14 @@ def _jump_frames(track: ObjectTrack, good: Mask, notes: list[str]) -> Mask:
 def _video_clock(T: Array, time_s: Array, control_hz: float, hold_s: float, ease_s: float, notes: list[str]) -> Array:
     """(N,) the video's time at each control knot: hold, gather speed, run, slow down, hold."""
     duration_s = float(time_s[-1] - time_s[0])
-    head = max(1, int(np.searchsorted(time_s, time_s[0] + 0.15)))
+    head = max(2, int(np.searchsorted(time_s, time_s[0] + _HEAD_S)) // 2)
     eases_s = []
-    for a, b, where in ((0, head, "begins"), (-1, -1 - head, "ends")):
-        span_s = abs(time_s[b] - time_s[a])
-        moving = (
-            np.linalg.norm(T[b, :3, 3] - T[a, :3, 3]) > _STILL_M_S * span_s
-            or rotation_angle_rad(T[b, :3, :3], T[a, :3, :3]) > _STILL_RAD_S * span_s
-        )
+    for ends, where in ((slice(None), "begins"), (slice(None, None, -1), "ends")):
+        # Means of two short stretches, so that jitter does not pass for motion.
+        near, far = (Rotation.from_matrix(T[ends][part, :3, :3]).mean() for part in _halves(head))
+        moved_m = np.diff([T[ends][part, :3, 3].mean(axis=0) for part in _halves(head)], axis=0)
+        span_s = abs(float(time_s[ends][head] - time_s[ends][0]))
+        moving = np.linalg.norm(moved_m) > _STILL_M_S * span_s or (near.inv() * far).magnitude() > _STILL_RAD_S * span_s
         eases_s.append(min(ease_s, 0.5 * duration_s) if moving else 0.0)
         if eases_s[-1] > 0:
             notes.append(f"The object already moves where the track {where}; the robot eases over {eases_s[-1]:.1f} s.")
@@ -173,3 +178,48 @@ def _video_clock(T: Array, time_s: Array, control_hz: float, hold_s: float, ease
     falling = duration_s - advance(total_s - hold_s - t, eases_s[1])
     clock_s = np.where(rising < 0.5 * duration_s, rising, falling)
     return np.asarray(time_s[0] + np.clip(clock_s, 0.0, duration_s))
+
+
+def _halves(count: int) -> tuple[slice, slice]:
+    return slice(0, count), slice(count, 2 * count)
+
+
+def _without_jitter(T: Array, confidence: Array, control_hz: float, notes: list[str]) -> Array:
+    """Poses smoothed as little as makes neighbouring accelerations agree; a track that is smooth stays as it is.
+
+    White noise makes second differences alternate (their correlation from knot to knot is -2/3), a hand's motion
+    makes them agree: that tells jitter from haste without knowing how fast the hand may be. Frames of low confidence
+    weigh less.
+    """
+    weight = np.maximum(confidence, 0.05)[:, None]
+    xyzw = Rotation.from_matrix(T[:, :3, :3]).as_quat()
+    # One sign along the way, so that averaging quaternions means something.
+    xyzw[1:] *= np.cumprod(np.where(np.sum(xyzw[1:] * xyzw[:-1], axis=1) < 0, -1.0, 1.0))[:, None]
+
+    def smoothed(value: Array, width_s: float) -> Array:
+        if width_s == 0.0:
+            return value
+        sigma = width_s * control_hz
+        top = gaussian_filter1d(weight * value, sigma, axis=0, mode="nearest")
+        return np.asarray(top / gaussian_filter1d(weight, sigma, axis=0, mode="nearest"))
+
+    out = T.copy()
+    for what, value, floor in (("position", T[:, :3, 3], JITTER_M), ("rotation", xyzw, 0.5 * JITTER_RAD)):
+        width_s = next((w for w in SMOOTHING_S if not _jitters(smoothed(value, w), floor)), SMOOTHING_S[-1])
+        if width_s == 0.0:
+            continue
+        notes.append(f"The tracked {what} jitters; it was smoothed over {width_s:.2f} s.")
+        if what == "position":
+            out[:, :3, 3] = smoothed(value, width_s)
+        else:
+            out[:, :3, :3] = Rotation.from_quat(smoothed(value, width_s)).as_matrix()
+    return out
+
+
+def _jitters(value: Array, floor: float) -> bool:
+    """Whether the second differences of (N, D) are larger than `floor` (rms) and alternate rather than agree."""
+    bend = np.diff(value, n=2, axis=0)
+    power = float(np.sum(bend**2))
+    if len(bend) < 8 or np.sqrt(power / len(bend)) < floor:
+        return False
+    return float(np.sum(bend[1:] * bend[:-1])) < 0.2 * power

@@ -84,7 +84,7 @@ def test_a_lagging_arm_is_told_with_distance_and_time(easy: tuple[Reference, Joi
 
 def test_collisions_make_it_infeasible(easy: tuple[Reference, JointTrajectory]) -> None:
     reference, joints = easy
-    hit = {"first": "hand", "second": "table", "time_s": 1.2, "depth_m": 0.01}
+    hit = {"first": "hand", "second": "table", "video_time_s": 1.2, "depth_m": 0.01}
     findings = feasibility(reference.with_header(feasibility={"collisions": [hit]}), joints)
     assert findings["feasible"] is False
     assert "the hand touches the table around 1.2 s" in findings["words"][0]
