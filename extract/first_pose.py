@@ -6,6 +6,7 @@ object's +z axis up in the image are tried on a finer grid and win ties; every o
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -13,14 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from .geometry import Array, make_pose, super_fibonacci_rotations, transform_points
+from .geometry import Array, make_pose, rotation_angle_rad, super_fibonacci_rotations, transform_points
 from .raster import render_depth
 from .region import TrackingMesh, edge_strength, extract_outline, mask_evidence, refine
 from .segment import Box, Mask, mask_box
 from .video import Image
 
 ELEVATIONS_DEG = (0.0, 8.0, 16.0, 26.0, 38.0, 52.0)
-UPRIGHT_BONUS = 0.04  # in intersection over union: about what a wrong rotation gains by chance
+UPRIGHT_BONUS = 0.15  # an outline alone often fits leaning toward and away from the camera as well
 EDGE_WEIGHT = 0.7
 BOX_WEIGHT = 0.7
 SEARCH_SIDE_PX = 72
@@ -90,10 +91,11 @@ def find_first_pose(
         T = _placed(mesh, R, small_camera, small_box)
         coarse.append(PoseCandidate(T, *silhouette_ious(mesh, T, small_camera, small_mask, small_box), upright))
     coarse.sort(key=lambda c: c.merit, reverse=True)
+    coarse = coarse[: keep // 2] + distinct(coarse[keep // 2 :], 20, keep - keep // 2, np.inf)
 
     bins, colours = mask_evidence(mask)
     found = []
-    for candidate in coarse[:keep]:
+    for candidate in coarse:
         result = refine(
             mesh, candidate.T_camera_object, camera_matrix, bins, colours, steps_px=(4, 3, 2, 1),
             prior_rotation_rad=0.12, prior_translation=0.05, prior_depth=0.1,
@@ -110,6 +112,17 @@ def judge(
     ious = silhouette_ious(mesh, T_camera_object, camera_matrix, mask, box)
     edge = edge_score(mesh, T_camera_object, camera_matrix, edge_strength(rgb))
     return PoseCandidate(T_camera_object, *ious, upright, edge)
+
+
+def distinct(candidates: Sequence[PoseCandidate], apart_deg: float, count: int, within: float) -> list[PoseCandidate]:
+    """The best candidates at least `apart_deg` from each other, none worse than the best by more than `within`."""
+    kept: list[PoseCandidate] = []
+    for candidate in candidates:
+        R = candidate.T_camera_object[:3, :3]
+        far = all(np.rad2deg(rotation_angle_rad(R, k.T_camera_object[:3, :3])) > apart_deg for k in kept)
+        if far and candidate.merit > candidates[0].merit - within and len(kept) < count:
+            kept.append(candidate)
+    return kept
 
 
 def silhouette_ious(

@@ -90,14 +90,16 @@ class Followed:
         poses = np.stack([e.T_camera_object for e in self.estimates])
         mesh, vessel = self.mesh, self.vessel
         if vessel is not None:
-            if vessel.symmetry.order != 0 and len(self.glimpses) > 1:
-                poses = self._with_settled_spin(poses, vessel)
+            poses = self._with_settled_spin(poses, vessel)
             vessel, shift = self._fitted(poses, vessel)
             if vessel is not self.vessel:
-                mesh, poses = tracking_mesh(vessel), poses @ shift
+                # A handle of the right size shows its side in frames where one of the wrong size did not.
+                mesh, poses = tracking_mesh(vessel), self._with_settled_spin(poses @ shift, vessel)
         return Followed.start(mesh, vessel, self.camera_matrix, first_rgb, self.first_mask, poses[0], poses)
 
     def _with_settled_spin(self, poses: Array, vessel: Vessel) -> Array:
+        if vessel.symmetry.order == 0 or len(self.glimpses) < 2:
+            return poses
         axis = vessel.interior.axis_xy_m
         camera = np.diag([0.5, 0.5, 1.0]) @ self.camera_matrix
         light = tracking_mesh(vessel, 3000)

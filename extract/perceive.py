@@ -12,11 +12,12 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from .detect import find_object, motion_since
 from .errors import UserError
 from .files import atomic_path
-from .first_pose import PoseCandidate, find_first_pose, judge
+from .first_pose import PoseCandidate, distinct, find_first_pose, judge
 from .follow import Followed
 from .geometry import Array, Symmetry, focal_prior_camera_matrix
 from .meshes import load_mesh, mesh_sha256
@@ -35,6 +36,8 @@ WORKING_SIDE_PX = 640  # tracking
 STARTING_SIDE_PX = 1280  # the first frame, where thin parts such as spouts must be seen to be fitted
 SMOOTHING_BANDWIDTH_S = 0.06
 FOUND_IOU = 0.45  # below this no pose of the mesh explains what was cut out of the first frame
+HYPOTHESES = 3  # first poses, far from each other, that a shape is fitted to
+HYPOTHESES_WITHIN = 0.35  # of the best one's merit
 FIT_ROUNDS = 3  # of cutting the mask near the silhouette and fitting the shape to it
 RECUT_BAND = 0.03  # of the object's size in the image
 
@@ -234,20 +237,46 @@ def _start(
     small = np.asarray(cv2.resize(rgb, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA), np.uint8)
     small_box, small_camera = _scaled(box, shrink), np.diag([shrink, shrink, 1.0]) @ camera_matrix
     small_mask = mask_from_box(small, small_box)
-    ranked: list[tuple[float, _Model, PoseCandidate]] = []
+    ranked: list[tuple[PoseCandidate, _Model]] = []
     for model in candidates:
-        found = find_first_pose(
+        poses = find_first_pose(
             model.mesh, small, small_mask, small_camera, box_xywh_px=small_box,
             continuous_symmetry=model.symmetry.order == 0,
         )  # fmt: skip
-        ranked.append((found[0].merit, model, found[0]))
-    _, model, pose = max(ranked, key=lambda entry: entry[0])
-    T = pose.T_camera_object
-    band_px = max(3, round(RECUT_BAND * max(box[2], box[3])))
-    if pose.iou < FOUND_IOU:
-        raise _not_found(request, info, f"the best silhouette covers only {pose.iou:.0%} of what was found")
-    evidence = _evidence(model.mesh, rgb, T, camera_matrix, _resized(small_mask, rgb), band_px)
+        ranked += [(pose, model) for pose in distinct(poses, 40, HYPOTHESES, HYPOTHESES_WITHIN)]
+    ranked.sort(key=lambda entry: entry[0].merit, reverse=True)
+    if ranked[0][0].iou < FOUND_IOU:
+        raise _not_found(request, info, f"the best silhouette covers only {ranked[0][0].iou:.0%} of what was found")
     edges = edge_strength(rgb)
+    band_px = max(3, round(RECUT_BAND * max(box[2], box[3])))
+    fits = [
+        _fitted(model, pose, rgb, edges, box, source, camera_matrix, band_px, _resized(small_mask, rgb))
+        for pose, model in ranked[:HYPOTHESES]
+    ]
+    model, pose, evidence = max(fits, key=lambda fit: fit[1].merit)
+    T = pose.T_camera_object
+    silhouette = _silhouette(model.mesh, T, camera_matrix, rgb.shape)
+    mask = _evidence(model.mesh, rgb, T, camera_matrix, evidence, band_px) & silhouette
+    if model.vessel is not None:
+        model = _vessel_model(coloured(model.vessel, rgb, mask))
+    return _Start(model, mask if mask.any() else silhouette, pose, mask_box(silhouette), source)
+
+
+def _fitted(
+    model: _Model,
+    pose: PoseCandidate,
+    rgb: Image,
+    edges: NDArray[np.float32],
+    box: Box,
+    source: str,
+    camera_matrix: Array,
+    band_px: int,
+    mask: Mask,
+) -> tuple[_Model, PoseCandidate, Mask]:
+    """One hypothesis carried on: the vessel's shape and pose fitted to the mask re-cut near its silhouette."""
+    T = pose.T_camera_object
+    evidence = _evidence(model.mesh, rgb, T, camera_matrix, mask, band_px)
+    pose = judge(model.mesh, T, camera_matrix, rgb, evidence, box, pose.upright)
     for _ in range(FIT_ROUNDS if model.vessel is not None else 0):
         assert model.vessel is not None
         view = View(*mask_evidence(evidence), T, box if source == "given" else None, edges)
@@ -259,11 +288,7 @@ def _start(
             break  # a mask that lost a thin part misled the fit: edges and box tell
         model, T, pose = fitted, T_fitted, after
         evidence = _evidence(model.mesh, rgb, T, camera_matrix, evidence, band_px)
-    silhouette = _silhouette(model.mesh, T, camera_matrix, rgb.shape)
-    mask = _evidence(model.mesh, rgb, T, camera_matrix, evidence, band_px) & silhouette
-    if model.vessel is not None:
-        model = _vessel_model(coloured(model.vessel, rgb, mask))
-    return _Start(model, mask if mask.any() else silhouette, pose, mask_box(silhouette), source)
+    return model, pose, evidence
 
 
 def _scaled(box: Box, scale: float) -> Box:

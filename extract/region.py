@@ -260,6 +260,7 @@ def refine(
     prior_rotation_rad: float = 0.15,
     prior_translation: float = 0.02,
     prior_depth: float = 0.01,
+    prior_spin_rad: float | None = None,
     edges: NDArray[np.float32] | None = None,
 ) -> Refinement:
     """Refine a pose against one image.
@@ -267,6 +268,7 @@ def refine(
     bins: (H, W) from `colour_bins`.  steps_px: sample spacing along the lines for each outer pass, coarse to fine.
     prior_*: standard deviation of the start pose, rotation in rad, translation as a fraction of the distance,
     sideways and along the viewing ray: directions the outline does not show stay where they were.
+    prior_spin_rad: the same for turns about the object's own +z, where it differs.
     edges: (H, W, 2) from `edge_strength`, to weigh image edges in with the colours; None for colours alone.
     """
     T_start: Array = T_camera_object.copy()
@@ -278,6 +280,9 @@ def refine(
     weight_t += np.outer(ray, ray) * (1 / (prior_depth * distance) ** 2 - 1 / (prior_translation * distance) ** 2)
     prior: Array = np.zeros((6, 6))
     prior[:3, :3] = np.eye(3) / prior_rotation_rad**2
+    if prior_spin_rad is not None:
+        up = T_start[:3, 2]
+        prior[:3, :3] += np.outer(up, up) * (1 / prior_spin_rad**2 - 1 / prior_rotation_rad**2)
     prior[3:, 3:] = weight_t
     for step_px in steps_px:
         lines = measure(mesh, T, camera_matrix, bins, colours, step_px, edges)
