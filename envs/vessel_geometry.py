@@ -23,10 +23,11 @@ if TYPE_CHECKING:
 
 MAX_FRUSTA = 4
 PROFILE_TOLERANCE_M = 0.0004
-# A particle that has sunk past the middle of a box is pushed out on the wrong side. 8 mm holds against anything the
-# arm can do at 2 ms steps; at the rim it is less so that the contents leave where the drawn wall ends. Floors and lids
-# carry the whole load in a shake and may be thicker unseen.
-WALL_M, RIM_WALL_M, PLATE_M = 0.008, 0.006, 0.015
+# A particle that has sunk past the middle of a box is pushed out on the wrong side. 12 mm holds against anything the
+# arm can do at 2 ms steps; in a band below the rim it is less so that the contents leave where the drawn wall ends.
+# Floors and lids carry the whole load in a shake and may be thicker unseen.
+WALL_M, RIM_WALL_M, PLATE_M = 0.012, 0.006, 0.015
+RIM_BAND_M = 0.015
 # Strips shorter than a particle would only add edges for it to be squeezed between.
 MIN_STRIP_M = 0.01
 WIDE_RADIUS_M = 0.045
@@ -161,7 +162,7 @@ class Cavity:
                 # Where the wall bulges, two boxes part on the outside: lengthen both to fill the wedge.
                 bend_below = slope[i - 1] - slope[i] if i else 0.0
                 bend_above = slope[i] - slope[i + 1] if i < frusta - 1 else 0.0
-                below = WALL_M if i == 0 else WALL_M * math.tan(max(0.0, min(bend_below, 1.5)) / 2)
+                below = PLATE_M if i == 0 else WALL_M * math.tan(max(0.0, min(bend_below, 1.5)) / 2)
                 above = WALL_M * math.tan(max(0.0, min(bend_above, 1.5)) / 2)
                 # The boxes of one ring part on the outside too: widen them by what the corner opens.
                 spread = wall_m * math.tan(step / 2)
@@ -197,10 +198,12 @@ class Cavity:
 
 
 def cavity_of(vessel: Vessel) -> Cavity:
-    """The hollow of a vessel, with at most `MAX_FRUSTA` frusta of 12 (16 if wide) sides and the true section areas."""
+    """The hollow of a vessel, with few frusta of 12 (16 if wide) sides and the true section areas."""
     profile = vessel.interior
-    keep = _levels(np.column_stack([profile.z_m, profile.radius_m]))
-    z, corner = profile.z_m[keep], profile.corner[keep]
+    z = profile.z_m[_levels(np.column_stack([profile.z_m, profile.radius_m]))]
+    if z[-1] - z[-2] > 2 * RIM_BAND_M:
+        z = np.insert(z, -1, z[-1] - RIM_BAND_M)
+    corner = np.interp(z, profile.z_m, profile.corner)
     r = _fitted_radii(profile.z_m, profile.radius_m, z)
     n = 16 if r.max() > WIDE_RADIUS_M else 12
     angle = 2 * np.pi * np.arange(n) / n

@@ -40,13 +40,17 @@ class PoseCandidate:
     T_camera_object: Array
     iou: float
     box_iou: float
-    upright: bool
     edge: float = 0.0
 
     @property
     def merit(self) -> float:
         """What candidates are ranked by."""
-        return self.iou + BOX_WEIGHT * self.box_iou + EDGE_WEIGHT * self.edge + UPRIGHT_BONUS * self.upright
+        return (
+            self.iou
+            + BOX_WEIGHT * self.box_iou
+            + EDGE_WEIGHT * self.edge
+            + UPRIGHT_BONUS * is_upright(self.T_camera_object)
+        )
 
 
 def upright_rotation(elevation_deg: float, yaw_deg: float, roll_deg: float = 0.0) -> Array:
@@ -58,6 +62,13 @@ def upright_rotation(elevation_deg: float, yaw_deg: float, roll_deg: float = 0.0
         "x", 90 + elevation_deg, degrees=True
     )
     return np.asarray((rotation * Rotation.from_euler("z", yaw_deg, degrees=True)).as_matrix())
+
+
+def is_upright(T_camera_object: Array) -> bool:
+    """Whether the object stands upright within 30 degrees in the image and is seen from above, as on a table."""
+    up, towards = T_camera_object[:3, 2], T_camera_object[:3, 3] / np.linalg.norm(T_camera_object[:3, 3])
+    lean_rad = np.arctan2(abs(up[0]), -up[1])
+    return bool(lean_rad < np.deg2rad(30) and up @ towards < np.sin(np.deg2rad(3)))
 
 
 def find_first_pose(
@@ -78,18 +89,18 @@ def find_first_pose(
     any_rotation: also try rotations that are not upright (600 of them, spread over SO(3)).
     """
     yaws = (0.0,) if continuous_symmetry else np.arange(0.0, 360.0, 10.0)
-    tries = [(upright_rotation(e, float(yaw)), True) for e in ELEVATIONS_DEG for yaw in yaws]
+    tries = [upright_rotation(e, float(yaw)) for e in ELEVATIONS_DEG for yaw in yaws]
     if any_rotation:
-        tries += [(R, False) for R in super_fibonacci_rotations(600)]
+        tries += list(super_fibonacci_rotations(600))
     box = box_xywh_px or mask_box(mask)
     scale = SEARCH_SIDE_PX / max(box[2], box[3])
     small_mask, small_camera = _shrunk(mask, camera_matrix, box, scale)
     pad_px = SEARCH_PAD * SEARCH_SIDE_PX
     small_box = (pad_px, pad_px, box[2] * scale, box[3] * scale)
     coarse = []
-    for R, upright in tries:
+    for R in tries:
         T = _placed(mesh, R, small_camera, small_box)
-        coarse.append(PoseCandidate(T, *silhouette_ious(mesh, T, small_camera, small_mask, small_box), upright))
+        coarse.append(PoseCandidate(T, *silhouette_ious(mesh, T, small_camera, small_mask, small_box)))
     coarse.sort(key=lambda c: c.merit, reverse=True)
     coarse = coarse[: keep // 2] + distinct(coarse[keep // 2 :], 20, keep - keep // 2, np.inf)
 
@@ -100,18 +111,18 @@ def find_first_pose(
             mesh, candidate.T_camera_object, camera_matrix, bins, colours, steps_px=(4, 3, 2, 1),
             prior_rotation_rad=0.12, prior_translation=0.05, prior_depth=0.1,
         )  # fmt: skip
-        found.append(judge(mesh, result.T_camera_object, camera_matrix, rgb, mask, box, candidate.upright))
+        found.append(judge(mesh, result.T_camera_object, camera_matrix, rgb, mask, box))
     found.sort(key=lambda c: c.merit, reverse=True)
     return found
 
 
 def judge(
-    mesh: TrackingMesh, T_camera_object: Array, camera_matrix: Array, rgb: Image, mask: Mask, box: Box, upright: bool
+    mesh: TrackingMesh, T_camera_object: Array, camera_matrix: Array, rgb: Image, mask: Mask, box: Box
 ) -> PoseCandidate:
     """How well a pose explains an image, the mask cut from it and the box around the object."""
     ious = silhouette_ious(mesh, T_camera_object, camera_matrix, mask, box)
     edge = edge_score(mesh, T_camera_object, camera_matrix, edge_strength(rgb))
-    return PoseCandidate(T_camera_object, *ious, upright, edge)
+    return PoseCandidate(T_camera_object, *ious, edge)
 
 
 def distinct(candidates: Sequence[PoseCandidate], apart_deg: float, count: int, within: float) -> list[PoseCandidate]:

@@ -276,14 +276,14 @@ def _fitted(
     """One hypothesis carried on: the vessel's shape and pose fitted to the mask re-cut near its silhouette."""
     T = pose.T_camera_object
     evidence = _evidence(model.mesh, rgb, T, camera_matrix, mask, band_px)
-    pose = judge(model.mesh, T, camera_matrix, rgb, evidence, box, pose.upright)
+    pose = judge(model.mesh, T, camera_matrix, rgb, evidence, box)
     for _ in range(FIT_ROUNDS if model.vessel is not None else 0):
         assert model.vessel is not None
         view = View(*mask_evidence(evidence), T, box if source == "given" else None, edges)
         vessel, (T_fitted,) = fit_shape(model.vessel, [view], camera_matrix)
         fitted = _vessel_model(vessel)
-        before = judge(model.mesh, T, camera_matrix, rgb, evidence, box, pose.upright)
-        after = judge(fitted.mesh, T_fitted, camera_matrix, rgb, evidence, box, pose.upright)
+        before = judge(model.mesh, T, camera_matrix, rgb, evidence, box)
+        after = judge(fitted.mesh, T_fitted, camera_matrix, rgb, evidence, box)
         if after.merit <= before.merit + 0.002:
             break  # a mask that lost a thin part misled the fit: edges and box tell
         model, T, pose = fitted, T_fitted, after

@@ -59,9 +59,11 @@ def escapes(env: PandaPourEnv, seed: int) -> tuple[int, int]:
             mujoco.mj_kinematics(env.model, env.data)
             T = env.T_world_object
             local = (env.particle_positions_m - T[:3, 3]) @ T[:3, :3]
-            left = inside & (cavity.clearance_m(local) < -radius_m)
-            through += int(np.count_nonzero(left & (local[:, 2] < cavity.rim_m - 1.5 * radius_m)))
-            inside &= ~left
+            # Outside means clear of the hollow and of the walls: a hard hit sinks in for a moment and comes back.
+            left = np.flatnonzero(inside & (cavity.clearance_m(local) < -radius_m))
+            left = left[np.min([box.distance_m(local[left]) for box in env._scene.vessel_boxes], axis=0) > 0.0]
+            through += int(np.count_nonzero(local[left, 2] < cavity.rim_m - 1.5 * radius_m))
+            inside[left] = False
     return through, int(np.count_nonzero(~inside))
 
 
