@@ -159,15 +159,15 @@ class SpoutConduit:
     states agree bit by bit.
     """
 
-    def __init__(self, vessel: Vessel, cavity: Cavity, radius_m: float, share: float) -> None:
-        """share: of the hollow's volume that one particle stands for."""
+    def __init__(self, vessel: Vessel, cavity: Cavity, boxes: list[Box], radius_m: float, share: float) -> None:
+        """boxes: the vessel's collision shapes; share: of the hollow's volume that one particle stands for."""
         outlet = vessel.outlet
         if outlet.entry_m is None:
             raise UserError(f"the {vessel.category}'s spout names no entry; rebuild the vessel with its channel")
         self._cavity, self._radius_m = cavity, radius_m
         self._entry_m, self._tip_m = np.asarray(outlet.entry_m, float), np.asarray(outlet.point_m, float)
         self._direction = np.asarray(outlet.direction, float)
-        self._slots_m = self._tip_m + radius_m * self._direction + self._slots(float(outlet.tip_radius_m or 0.0))
+        self._slots_m = self._clear_of(boxes, self._tip_m + self._slots(float(outlet.tip_radius_m or 0.0)))
         self._samples_m = cavity.sample(LEVEL_SAMPLES)
         self._share = share
 
@@ -182,6 +182,14 @@ class SpoutConduit:
         v = np.cross(self._direction, u)
         angle = np.arange(6)[:, None] * (math.pi / 3)
         return np.vstack([np.zeros((1, 3)), ring_m * (np.cos(angle) * u + np.sin(angle) * v)])
+
+    def _clear_of(self, boxes: list[Box], slots_m: Array) -> Array:
+        """Slots moved out along the outlet by a radius, and on until they clear the walls of a spout close to the body."""
+        for out_m in self._radius_m + np.linspace(0.0, 0.03, 31):
+            moved = slots_m + out_m * self._direction
+            if min(box.distance_m(moved).min() for box in boxes) >= self._radius_m:
+                break
+        return moved
 
     def level_m(self, T_world_vessel: Array, held: int) -> float:
         """Height in the world of the surface of the liquid that `held` particles stand for; -inf when there is none."""

@@ -285,7 +285,7 @@ class PandaPourEnv(gym.Env[Observation, NDArray[np.float32]]):
         if scene.num_particles == 0:
             return None
         share = level_share(scene.liquid, scene.vessel_cavity, scene.num_particles, scene.radius_m)
-        return SpoutConduit(scene.vessel, scene.vessel_cavity, scene.radius_m, share)
+        return SpoutConduit(scene.vessel, scene.vessel_cavity, scene.vessel_boxes, scene.radius_m, share)
 
     def _settle(self) -> tuple[Array, int]:
         """(N, 3) resting places of the particles in the vessel's frame, and how many stay inside it."""

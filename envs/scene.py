@@ -18,7 +18,7 @@ from ..extract.errors import UserError
 from ..extract.geometry import Array, invert_pose, look_at, make_pose, transform_points
 from .liquid import Liquid, add_particles
 from .panda import CONTACT_PARTICLE, CONTACT_ROBOT, CONTACT_VESSEL, panda_spec
-from .vessel_geometry import Box, Cavity, cavity_of, collision_boxes, visual_parts
+from .vessel_geometry import STANDING_WALL_M, Box, Cavity, cavity_of, collision_boxes, visual_parts
 
 if TYPE_CHECKING:
     from ..extract.vessels import Vessel
@@ -78,7 +78,8 @@ def build_scene(reference: Reference, num_particles: int, liquid: Liquid, timest
     _add_vessel(spec, held, vessel, vessel_boxes, vessel_contact)
     held.gravcomp = 1.0
     standing = spec.worldbody.add_body(name=RECEPTACLE_BODY, **_placed(T_world_receptacle))
-    _add_vessel(spec, standing, receptacle, collision_boxes(receptacle, receptacle_cavity), vessel_contact)
+    standing_boxes = collision_boxes(receptacle, receptacle_cavity, STANDING_WALL_M)
+    _add_vessel(spec, standing, receptacle, standing_boxes, vessel_contact)
     _add_pedestal(spec, standing, receptacle, T_world_receptacle, vessel_contact)
     particle_contact = {**contact, "contype": CONTACT_PARTICLE, "conaffinity": CONTACT_PARTICLE | CONTACT_VESSEL}
     add_particles(spec, num_particles, radius_m, liquid, particle_contact, WATER_RGBA)

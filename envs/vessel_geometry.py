@@ -23,11 +23,13 @@ if TYPE_CHECKING:
 
 MAX_FRUSTA = 4
 PROFILE_TOLERANCE_M = 0.0004
-# A particle that has sunk past the middle of a box is pushed out on the wrong side. 12 mm holds against anything the
-# arm can do at 2 ms steps; in a band below the rim it is less so that the contents leave where the drawn wall ends.
-# Floors and lids carry the whole load in a shake and may be thicker unseen.
-WALL_M, RIM_WALL_M, PLATE_M = 0.012, 0.006, 0.015
+# A particle that has sunk past the middle of a box is pushed out on the wrong side. A vessel that is swung needs thicker
+# walls than one that stands; in a band below the rim they are thin so that the contents leave where the drawn wall
+# ends. Floors and lids carry the whole load in a shake and may be thicker unseen.
+SWUNG_WALL_M, STANDING_WALL_M, RIM_WALL_M, PLATE_M = 0.016, 0.01, 0.006, 0.02
 RIM_BAND_M = 0.015
+# How far neighbouring boxes run on beyond their seam, and how far that may reach into the hollow at a waist.
+OVERLAP_M, INTRUSION_M = 0.006, 0.0001
 # Strips shorter than a particle would only add edges for it to be squeezed between.
 MIN_STRIP_M = 0.01
 WIDE_RADIUS_M = 0.045
@@ -144,8 +146,8 @@ class Cavity:
         points = low + grid * (high - low)
         return np.asarray(points[self.contains(points)][:count])
 
-    def walls(self) -> list[Box]:
-        """One box for each polygon edge between each two levels."""
+    def walls(self, wall_m: float, rim_wall_m: float) -> list[Box]:
+        """One box for each polygon edge between each two levels, `wall_m` thick, `rim_wall_m` between the top two."""
         step = 2 * math.pi / len(self.normals)
         left, right = self._edge_ends(step)
         frusta = len(self.z_m) - 1
@@ -156,16 +158,16 @@ class Cavity:
             run, rise = np.diff(self.support_m[:, k]), np.diff(self.z_m)
             slope = np.arctan2(run, rise)  # from the vertical, positive where the wall leans outward
             for i in range(frusta):
-                wall_m = RIM_WALL_M if i == frusta - 1 else WALL_M
+                depth_m = rim_wall_m if i == frusta - 1 else wall_m
                 along = np.array([*(outward[:2] * math.sin(slope[i])), math.cos(slope[i])])
                 normal_3d = np.array([*(outward[:2] * math.cos(slope[i])), -math.sin(slope[i])])
-                # Where the wall bulges, two boxes part on the outside: lengthen both to fill the wedge.
+                # A hard hit sinks in and is pushed out through the nearest face: boxes overlap amply, so that this is
+                # the inner face and no end or side. Where the wall bulges that also fills the wedge between two boxes.
                 bend_below = slope[i - 1] - slope[i] if i else 0.0
                 bend_above = slope[i] - slope[i + 1] if i < frusta - 1 else 0.0
-                below = PLATE_M if i == 0 else WALL_M * math.tan(max(0.0, min(bend_below, 1.5)) / 2)
-                above = WALL_M * math.tan(max(0.0, min(bend_above, 1.5)) / 2)
-                # The boxes of one ring part on the outside too: widen them by what the corner opens.
-                spread = wall_m * math.tan(step / 2)
+                below = PLATE_M if i == 0 else _overlap_m(bend_below, wall_m)
+                above = 0.0 if i == frusta - 1 else _overlap_m(bend_above, wall_m)
+                spread = depth_m * math.tan(step / 2) + OVERLAP_M
                 start = min(left[i, k], left[i + 1, k]) - spread
                 end = max(right[i, k], right[i + 1, k]) + spread
                 length = math.hypot(run[i], rise[i])
@@ -174,9 +176,9 @@ class Cavity:
                     foot
                     + along * ((length + above - below) / 2)
                     + tangent * ((start + end) / 2)
-                    + normal_3d * (wall_m / 2)
+                    + normal_3d * (depth_m / 2)
                 )
-                half = np.array([(end - start) / 2, (length + above + below) / 2, wall_m / 2])
+                half = np.array([(end - start) / 2, (length + above + below) / 2, depth_m / 2])
                 boxes.append(Box(center, np.column_stack([tangent, along, normal_3d]), half))
         return boxes
 
@@ -185,7 +187,7 @@ class Cavity:
         support = self.support_m[level]
         round_ = bool(np.ptp(support) < 0.05 * support.max())
         n = len(support)
-        half_x, half_y = support[0] + WALL_M, support[n // 4] + WALL_M
+        half_x, half_y = support[0] + STANDING_WALL_M, support[n // 4] + STANDING_WALL_M
         z = self.z_m[level] + (PLATE_M if above else -PLATE_M) / 2
         return Box(np.array([*self.axis_xy_m, z]), np.eye(3), np.array([half_x, half_y, PLATE_M / 2]), round_)
 
@@ -233,6 +235,16 @@ def _levels(profile: Array) -> NDArray[np.int64]:
     return np.array(keep)
 
 
+def _overlap_m(bend_rad: float, wall_m: float) -> float:
+    """How far a wall's box runs on past a bend, positive where the wall bulges.
+
+    Past a bulge the box only gets farther from the hollow; past a waist it would stick into it, so it stops at once.
+    """
+    if bend_rad >= 0.0:
+        return OVERLAP_M + wall_m * math.tan(min(bend_rad, 1.5) / 2)
+    return min(OVERLAP_M, INTRUSION_M / math.sin(min(-bend_rad, 1.5)))
+
+
 def _fitted_radii(z: Array, r: Array, levels: Array) -> Array:
     """Radii at `levels` whose straight joins come nearest to the profile (z, r), in the sense of squared areas."""
     fine = np.linspace(z[0], z[-1], 400)
@@ -244,9 +256,10 @@ def _fitted_radii(z: Array, r: Array, levels: Array) -> Array:
     return np.asarray(np.maximum(fitted, 0.25 * np.interp(levels, z, r)))
 
 
-def collision_boxes(vessel: Vessel, cavity: Cavity) -> list[Box]:
+def collision_boxes(vessel: Vessel, cavity: Cavity, wall_m: float = SWUNG_WALL_M) -> list[Box]:
     """Walls, floor and, for a closed vessel, the lid."""
-    boxes = [*cavity.walls(), cavity.plate(0, above=False)]
+    rim_wall_m = RIM_WALL_M if vessel.is_open else STANDING_WALL_M
+    boxes = [*cavity.walls(wall_m, rim_wall_m), cavity.plate(0, above=False)]
     if not vessel.is_open:
         boxes.append(cavity.plate(-1, above=True))
     return boxes

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from .geometry import Array, make_pose, rotation_angle_rad, super_fibonacci_rotations, transform_points
+from .geometry import Array, Symmetry, make_pose, super_fibonacci_rotations, transform_points
 from .raster import render_depth
 from .region import TrackingMesh, edge_strength, extract_outline, mask_evidence, refine
 from .segment import Box, Mask, mask_box
@@ -23,7 +23,7 @@ from .video import Image
 ELEVATIONS_DEG = (0.0, 8.0, 16.0, 26.0, 38.0, 52.0)
 UPRIGHT_BONUS = 0.15  # an outline alone often fits leaning toward and away from the camera as well
 EDGE_WEIGHT = 0.7
-BOX_WEIGHT = 0.7
+BOX_WEIGHT = 1.2
 SEARCH_SIDE_PX = 72
 SEARCH_PAD = 0.25  # of the longer side, around the box
 
@@ -78,17 +78,17 @@ def find_first_pose(
     camera_matrix: Array,
     *,
     box_xywh_px: Box | None = None,
-    continuous_symmetry: bool = False,
+    symmetry: Symmetry = Symmetry(),  # noqa: B008 - frozen
     any_rotation: bool = True,
-    keep: int = 24,
+    keep: int = 60,
 ) -> list[PoseCandidate]:
     """Poses that explain a mask, best first.
 
     box_xywh_px: box around the whole object; the mask's own when not given.
-    continuous_symmetry: the mesh looks the same from all sides, so that yaw need not be searched.
+    symmetry: turns after which the mesh looks the same need not be searched.
     any_rotation: also try rotations that are not upright (600 of them, spread over SO(3)).
     """
-    yaws = (0.0,) if continuous_symmetry else np.arange(0.0, 360.0, 10.0)
+    yaws = np.arange(0.0, 360.0 / symmetry.order, 10.0) if symmetry.order else (0.0,)
     tries = [upright_rotation(e, float(yaw)) for e in ELEVATIONS_DEG for yaw in yaws]
     if any_rotation:
         tries += list(super_fibonacci_rotations(600))
@@ -102,7 +102,7 @@ def find_first_pose(
         T = _placed(mesh, R, small_camera, small_box)
         coarse.append(PoseCandidate(T, *silhouette_ious(mesh, T, small_camera, small_mask, small_box)))
     coarse.sort(key=lambda c: c.merit, reverse=True)
-    coarse = coarse[: keep // 2] + distinct(coarse[keep // 2 :], 20, keep - keep // 2, np.inf)
+    coarse = coarse[: keep // 5] + distinct(coarse[keep // 5 :], 15, keep - keep // 5, np.inf, symmetry)
 
     bins, colours = mask_evidence(mask)
     found = []
@@ -125,12 +125,14 @@ def judge(
     return PoseCandidate(T_camera_object, *ious, edge)
 
 
-def distinct(candidates: Sequence[PoseCandidate], apart_deg: float, count: int, within: float) -> list[PoseCandidate]:
+def distinct(
+    candidates: Sequence[PoseCandidate], apart_deg: float, count: int, within: float, symmetry: Symmetry
+) -> list[PoseCandidate]:
     """The best candidates at least `apart_deg` from each other, none worse than the best by more than `within`."""
     kept: list[PoseCandidate] = []
     for candidate in candidates:
         R = candidate.T_camera_object[:3, :3]
-        far = all(np.rad2deg(rotation_angle_rad(R, k.T_camera_object[:3, :3])) > apart_deg for k in kept)
+        far = all(np.rad2deg(symmetry.error_rad(R, k.T_camera_object[:3, :3])) > apart_deg for k in kept)
         if far and candidate.merit > candidates[0].merit - within and len(kept) < count:
             kept.append(candidate)
     return kept

@@ -36,8 +36,8 @@ WORKING_SIDE_PX = 640  # tracking
 STARTING_SIDE_PX = 1280  # the first frame, where thin parts such as spouts must be seen to be fitted
 SMOOTHING_BANDWIDTH_S = 0.06
 FOUND_IOU = 0.45  # below this no pose of the mesh explains what was cut out of the first frame
-HYPOTHESES = 3  # first poses, far from each other, that a shape is fitted to
-HYPOTHESES_WITHIN = 0.35  # of the best one's merit
+HYPOTHESES = 4  # first poses, far from each other, that a shape is fitted to
+HYPOTHESES_WITHIN = 0.5  # of the best one's merit
 FIT_ROUNDS = 3  # of cutting the mask near the silhouette and fitting the shape to it
 RECUT_BAND = 0.03  # of the object's size in the image
 
@@ -241,9 +241,9 @@ def _start(
     for model in candidates:
         poses = find_first_pose(
             model.mesh, small, small_mask, small_camera, box_xywh_px=small_box,
-            continuous_symmetry=model.symmetry.order == 0,
+            symmetry=model.symmetry,
         )  # fmt: skip
-        ranked += [(pose, model) for pose in distinct(poses, 40, HYPOTHESES, HYPOTHESES_WITHIN)]
+        ranked += [(pose, model) for pose in distinct(poses, 40, HYPOTHESES, HYPOTHESES_WITHIN, model.symmetry)]
     ranked.sort(key=lambda entry: entry[0].merit, reverse=True)
     if ranked[0][0].iou < FOUND_IOU:
         raise _not_found(request, info, f"the best silhouette covers only {ranked[0][0].iou:.0%} of what was found")

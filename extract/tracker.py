@@ -88,7 +88,7 @@ class ObjectTracker:
     ) -> Estimate:
         result = refine(
             self.mesh, start, self.camera_matrix, bins, self.colours, steps_px=steps_px,
-            prior_rotation_rad=0.03 * freedom, prior_spin_rad=0.01 * freedom,
+            prior_rotation_rad=0.03 * freedom, prior_spin_rad=0.02 * freedom,
             prior_translation=0.02 * freedom, prior_depth=0.01 * freedom,
             edges=strength if TRACK_EDGES else None,
         )  # fmt: skip

@@ -7,7 +7,7 @@ from vid2demo.envs.liquid import Liquid, SpoutConduit, count_particles, fill_pos
 from vid2demo.envs.vessel_geometry import cavity_of, collision_boxes
 from vid2demo.extract.errors import UserError
 from vid2demo.extract.geometry import make_pose
-from vid2demo.extract.vessels import make_vessel
+from vid2demo.extract.vessels import CATEGORIES, make_vessel
 
 RADIUS_M = 0.004
 SHARE = 0.0025  # a hundred particles stand for a quarter of the hollow
@@ -86,7 +86,8 @@ class TestSpout:
     @pytest.fixture
     def conduit(self) -> SpoutConduit:
         vessel = make_vessel("gooseneck_kettle")
-        return SpoutConduit(vessel, cavity_of(vessel), RADIUS_M, SHARE)
+        cavity = cavity_of(vessel)
+            return SpoutConduit(vessel, cavity, collision_boxes(vessel, cavity), RADIUS_M, SHARE)
 
     @pytest.fixture
     def tip_m(self) -> np.ndarray:
@@ -146,4 +147,20 @@ class TestSpout:
     def test_a_spout_without_an_entry_is_refused(self) -> None:
         mug = make_vessel("mug")
         with pytest.raises(UserError, match="names no entry"):
-            SpoutConduit(mug, cavity_of(mug), RADIUS_M, SHARE)
+            SpoutConduit(mug, cavity_of(mug), [], RADIUS_M, SHARE)
+
+
+@pytest.mark.parametrize("category", [c for c in CATEGORIES if make_vessel(c).outlet.kind == "spout"])
+def test_every_spout_lets_go_near_its_tip_and_clear_of_the_walls(category: str) -> None:
+    vessel = make_vessel(category)
+    cavity = cavity_of(vessel)
+    boxes = collision_boxes(vessel, cavity)
+    conduit = SpoutConduit(vessel, cavity, boxes, RADIUS_M, SHARE)
+    T = tilted(89.0)
+    points = fill_positions(cavity, boxes, 100, RADIUS_M, category) @ T[:3, :3].T + T[:3, 3]
+    before = points.copy()
+    assert conduit.move(points, np.zeros_like(points), T, np.zeros(6))
+    left = points[np.any(points != before, axis=1)]
+    local = (left - T[:3, 3]) @ T[:3, :3]
+    assert np.linalg.norm(local - vessel.outlet.point_m) < 0.03
+    assert min(box.distance_m(local)[0] for box in boxes) >= 0.999 * RADIUS_M
