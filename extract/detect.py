@@ -77,7 +77,7 @@ def find_object(
     matches.sort(key=lambda m: m.score, reverse=True)
 
     size = (small.shape[1], small.shape[0])
-    small_moved = cv2.resize(moved.astype(np.float32), size)
+    small_moved = np.asarray(cv2.resize(moved.astype(np.float32), size), np.float32)
     small_taken = [cv2.resize(mask.astype(np.uint8), size) > 0 for mask in taken]
     lab = _soft_lab(np.asarray(small, np.uint8))
     judged: list[tuple[float, _Match]] = []

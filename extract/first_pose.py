@@ -163,7 +163,7 @@ def edge_score(
     mesh: TrackingMesh, T_camera_object: Array, camera_matrix: Array, strength: NDArray[np.float32]
 ) -> float:
     """Share of the outline, in [0, 1], along which the image has an edge of the same direction within 2 px."""
-    outline = extract_outline(mesh, T_camera_object, camera_matrix, strength.shape[:2])
+    outline = extract_outline(mesh, T_camera_object, camera_matrix, (strength.shape[0], strength.shape[1]))
     if outline is None:
         return 0.0
     best = np.zeros(len(outline))

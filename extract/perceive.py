@@ -205,7 +205,7 @@ def _candidate_models(request: ObjectRequest) -> list[_Model]:
     """The user's mesh, or the nominal vessel of every category that the name may mean."""
     if request.mesh is not None:
         mesh = load_mesh(request.mesh, request.mesh_unit)
-        header = {"name": request.mesh.name, "file": str(request.mesh), "unit": request.mesh_unit}
+        header: dict[str, Any] = {"name": request.mesh.name, "file": str(request.mesh), "unit": request.mesh_unit}
         header |= {"sha256": mesh_sha256(mesh), "extents_m": [float(v) for v in mesh.extents]}
         light = mesh if len(mesh.faces) <= 4000 else mesh.simplify_quadric_decimation(face_count=4000)
         return [_Model(TrackingMesh.build(np.asarray(light.vertices), np.asarray(light.faces)), Symmetry(), header)]

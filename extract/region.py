@@ -273,7 +273,8 @@ def refine(
     """
     T_start: Array = T_camera_object.copy()
     T: Array = T_camera_object.copy()
-    score, count, information = -np.inf, 0, np.zeros((6, 6))
+    score, count = -np.inf, 0
+    information: Array = np.zeros((6, 6))
     distance = float(np.linalg.norm(T_start[:3, 3]))
     ray = T_start[:3, 3] / distance
     weight_t: Array = np.eye(3) / (prior_translation * distance) ** 2

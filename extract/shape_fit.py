@@ -103,7 +103,7 @@ def fit_shape(
         tail = slice(6 * len(used), size)
         normal[tail, tail] += np.diag(1 / prior_std**2)
         gradient[tail] -= (values - start) / prior_std**2
-        delta = np.linalg.solve(normal, gradient)
+        delta: Array = np.asarray(np.linalg.solve(normal, gradient), float)
         for slot, k in enumerate(used):
             poses[k] = _moved(poses[k], delta[6 * slot : 6 * slot + 6])
         values = np.clip(values + delta[tail], low, high)

@@ -46,7 +46,8 @@ class ObjectTracker:
         bins = colour_bins(rgb)
         near = cv2.dilate(mask.astype(np.uint8), np.ones((41, 41), np.uint8)) > 0
         self.colours.start_global(bins[mask], bins[near & ~mask])
-        if (outline := extract_outline(mesh, T_camera_object, camera_matrix, mask.shape)) is not None:
+        outline = extract_outline(mesh, T_camera_object, camera_matrix, (mask.shape[0], mask.shape[1]))
+        if outline is not None:
             self.colours.update(outline, mesh, bins, 1.0)
 
     def step(self, rgb: Image, guess: Array | None = None) -> Estimate:
@@ -65,7 +66,8 @@ class ObjectTracker:
             self._before = self._pose
             best = Estimate(self._pose, best.confidence, False)
         if best.confidence >= LEARN_ABOVE:
-            outline = extract_outline(self.mesh, best.T_camera_object, self.camera_matrix, rgb.shape[:2])
+            shape = (rgb.shape[0], rgb.shape[1])
+            outline = extract_outline(self.mesh, best.T_camera_object, self.camera_matrix, shape)
             if outline is not None:
                 self.colours.update(outline, self.mesh, bins, LEARNING_RATE)
         return best
