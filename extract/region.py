@@ -113,10 +113,16 @@ class ColourModel:
 
 def edge_strength(rgb: Image) -> NDArray[np.float32]:
     """(H, W, 2) image gradient, the largest of the three channels, scaled so that a clear edge has length 1."""
-    blurred = cv2.GaussianBlur(rgb, (0, 0), 1.0).astype(np.float32)
-    gradient = np.stack([cv2.Sobel(blurred, cv2.CV_32F, *order, scale=1 / 8) for order in ((1, 0), (0, 1))], axis=-1)
-    channel = np.argmax(np.linalg.norm(gradient, axis=-1), axis=-1)
-    strongest = np.take_along_axis(gradient, channel[..., None, None], axis=2)[:, :, 0]
+    blurred = cv2.GaussianBlur(rgb, (0, 0), 1.0)
+    x, y = (cv2.split(cv2.Sobel(blurred, cv2.CV_32F, *order, scale=1 / 8)) for order in ((1, 0), (0, 1)))
+    best_x, best_y = x[0], y[0]
+    best = best_x * best_x + best_y * best_y
+    for gx, gy in zip(x[1:], y[1:], strict=True):
+        square = gx * gx + gy * gy
+        stronger = square > best
+        best = np.where(stronger, square, best)
+        best_x, best_y = np.where(stronger, gx, best_x), np.where(stronger, gy, best_y)
+    strongest = np.stack([best_x, best_y], axis=-1)
     return np.asarray(strongest / CLEAR_EDGE, np.float32)
 
 

@@ -16,6 +16,7 @@ HALF_LINE = 10  # samples on either side of the outline
 # An outline on a clear image edge is this much likelier than one on none; steps beyond 2 px would miss edges.
 EDGE_WEIGHT, EDGE_FLOOR, EDGE_STEP_PX = 1.0, 0.2, 2.0
 AMPLITUDE, SLOPE = 0.40, 1.0  # of the smooth step between inside and outside (SRT3D, eq. 13)
+INSIDE_SHARE = 0.5 - AMPLITUDE * np.tanh(np.arange(-2 * HALF_LINE, 2 * HALF_LINE + 1) / (2.0 * SLOPE))
 
 
 @numba.njit(cache=True)
@@ -117,10 +118,12 @@ def measure_lines(
             continue
         top = -1e30
         for d in range(n):
-            total = 0.0
+            # One logarithm of the product: 21 factors above 0.05 are far from underflow.
+            product = 1.0
             for j in range(n):
-                inside_share = 0.5 - AMPLITUDE * np.tanh((j - d) / (2.0 * SLOPE))
-                total += np.log(inside_share * p_f[j] + (1.0 - inside_share) * (1.0 - p_f[j]))
+                inside_share = INSIDE_SHARE[j - d + 2 * HALF_LINE]
+                product *= inside_share * p_f[j] + (1.0 - inside_share) * (1.0 - p_f[j])
+            total = np.log(product)
             if use_edges:
                 r = (d - HALF_LINE) * step_px
                 x = round(pixel[i, 0] + r * normal[i, 0])
