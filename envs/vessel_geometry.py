@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 
 MAX_FRUSTA = 4
 PROFILE_TOLERANCE_M = 0.0004
-# A particle that has sunk past the middle of a box is pushed out on the wrong side. A vessel that is swung needs thicker
-# walls than one that stands; in a band below the rim they are thin so that the contents leave where the drawn wall
-# ends. Floors and lids carry the whole load in a shake and may be thicker unseen.
+# A particle that has sunk past the middle of a box is pushed out on the wrong side. A vessel that is swung needs
+# thicker walls than one that stands; in a band below the rim they are thin so that the contents leave where the drawn
+# wall ends. Floors and lids carry the whole load in a shake and may be thicker unseen.
 SWUNG_WALL_M, STANDING_WALL_M, RIM_WALL_M, PLATE_M = 0.016, 0.01, 0.006, 0.02
 RIM_BAND_M = 0.015
 # How far neighbouring boxes run on beyond their seam, and how far that may reach into the hollow at a waist.

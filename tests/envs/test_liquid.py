@@ -87,7 +87,7 @@ class TestSpout:
     def conduit(self) -> SpoutConduit:
         vessel = make_vessel("gooseneck_kettle")
         cavity = cavity_of(vessel)
-            return SpoutConduit(vessel, cavity, collision_boxes(vessel, cavity), RADIUS_M, SHARE)
+        return SpoutConduit(vessel, cavity, collision_boxes(vessel, cavity), RADIUS_M, SHARE)
 
     @pytest.fixture
     def tip_m(self) -> np.ndarray:
