@@ -1,0 +1,71 @@
+"""Which first poses count as upright, and which of them are worth carrying on beside each other."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from vid2demo.extract.first_pose import PoseCandidate, distinct, is_upright, upright_rotation
+from vid2demo.extract.geometry import Symmetry, make_pose
+
+
+@pytest.mark.parametrize(
+    ("elevation_deg", "yaw_deg", "roll_deg", "expected"),
+    [
+        (20, 0, 0, True),
+        (0, 130, 0, True),  # seen from the side, at the height of the table
+        (50, 250, 0, True),
+        (20, 40, 25, True),
+        (20, 40, -25, True),
+        (20, 40, 40, False),  # leaning too far
+        (20, 40, -40, False),
+        (-15, 40, 0, False),  # seen from below
+        (20, 40, 180, False),  # upside down
+        (10, 0, 90, False),  # lying
+    ],
+)
+def test_upright_is_standing_and_seen_from_above(
+    elevation_deg: float, yaw_deg: float, roll_deg: float, expected: bool
+) -> None:
+    assert is_upright(make_pose(upright_rotation(elevation_deg, yaw_deg, roll_deg), (0.0, 0.0, 0.6))) is expected
+
+
+def test_from_where_an_object_is_seen_depends_on_its_place_in_the_image() -> None:
+    """High in the image the camera looks up at what, by its rotation alone, it would see slightly from above."""
+    R = upright_rotation(8, 40)
+    assert is_upright(make_pose(R, (0.0, 0.1, 0.6)))
+    assert not is_upright(make_pose(R, (0.0, -0.2, 0.6)))
+
+
+def candidate(yaw_deg: float, iou: float) -> PoseCandidate:
+    return PoseCandidate(make_pose(upright_rotation(20, yaw_deg), (0.0, 0.0, 0.6)), iou, 0.0)
+
+
+def yaws_deg(kept: list[PoseCandidate], pool: list[PoseCandidate], yaws: list[float]) -> list[float]:
+    return [yaws[next(i for i, c in enumerate(pool) if c is k)] for k in kept]
+
+
+@pytest.mark.parametrize(
+    ("symmetry", "expected"),
+    [
+        (Symmetry(), [0, 180, 90]),
+        (Symmetry(order=2), [0, 90]),  # half a turn shows the same object again
+        (Symmetry(order=4), [0]),
+        (Symmetry(order=0), [0]),
+    ],
+)
+def test_distinct_poses_are_the_best_ones_that_look_different(symmetry: Symmetry, expected: list[float]) -> None:
+    yaws = [0.0, 10.0, 180.0, 90.0, 100.0]
+    pool = [candidate(yaw, 0.9 - 0.05 * i) for i, yaw in enumerate(yaws)]
+    kept = distinct(pool, 40, 4, 0.5, symmetry)
+    assert yaws_deg(kept, pool, yaws) == expected
+    assert kept[0] is pool[0]
+
+
+def test_distinct_poses_are_limited_in_number_and_in_how_much_worse_they_are() -> None:
+    yaws = [0.0, 90.0, 180.0, 270.0]
+    pool = [candidate(yaw, iou) for yaw, iou in zip(yaws, (0.9, 0.8, 0.7, 0.2), strict=True)]
+    assert len(distinct(pool, 40, 2, 0.5, Symmetry())) == 2
+    assert yaws_deg(distinct(pool, 40, 4, 0.5, Symmetry()), pool, yaws) == [0, 90, 180]
+    assert len(distinct(pool, 40, 4, 0.8, Symmetry())) == 4
+    merits = np.array([c.merit for c in pool])
+    assert np.all(np.diff(merits) < 0)
