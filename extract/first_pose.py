@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from .geometry import Array, Symmetry, make_pose, super_fibonacci_rotations, transform_points
 from .raster import render_depth
-from .region import TrackingMesh, edge_strength, extract_outline, mask_evidence, refine
+from .region import Outline, TrackingMesh, edge_strength, extract_outline, mask_evidence, refine
 from .segment import Box, Mask, mask_box
 from .video import Image
 
@@ -164,8 +164,11 @@ def edge_score(
 ) -> float:
     """Share of the outline, in [0, 1], along which the image has an edge of the same direction within 2 px."""
     outline = extract_outline(mesh, T_camera_object, camera_matrix, (strength.shape[0], strength.shape[1]))
-    if outline is None:
-        return 0.0
+    return 0.0 if outline is None else share_on_edges(outline, strength)
+
+
+def share_on_edges(outline: Outline, strength: NDArray[np.float32]) -> float:
+    """`edge_score` of an outline drawn before."""
     best = np.zeros(len(outline))
     for offset in range(-2, 3):
         x, y = np.round(outline.pixel + offset * outline.normal).astype(int).T

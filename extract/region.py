@@ -220,9 +220,10 @@ def measure(
     colours: ColourModel,
     step_px: float,
     edges: NDArray[np.float32] | None = None,
+    outline: Outline | None = None,
 ) -> Lines | None:
-    """Read every line of the outline at one pose; None when fewer than 12 are usable."""
-    outline = extract_outline(mesh, T_camera_object, camera_matrix, (bins.shape[0], bins.shape[1]))
+    """Read every line of the outline at one pose, drawn anew if not given; None when fewer than 12 are usable."""
+    outline = outline or extract_outline(mesh, T_camera_object, camera_matrix, (bins.shape[0], bins.shape[1]))
     if outline is None:
         return None
     nearest = mesh.tree.query(outline.point_object_m, k=3)[1].astype(np.int32)

@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from .first_pose import edge_score
-from .geometry import Array
-from .raster import render_depth
-from .region import ColourModel, TrackingMesh, colour_bins, edge_strength, extract_outline, measure, refine
+from .first_pose import share_on_edges
+from .geometry import Array, project, transform_points
+from .region import ColourModel, Outline, TrackingMesh, colour_bins, edge_strength, extract_outline, measure, refine
 from .segment import Mask
 from .video import Image
 
 LEARNING_RATE = 0.15
 LEARN_ABOVE = 0.35  # a frame the tracker is unsure of teaches it nothing
-TRACK_EDGES = True
 LOST_BELOW = 0.2
 VELOCITY_KEPT = 0.7  # hands accelerate: half-trusting the last velocity beats trusting it or ignoring it
 SEARCH_STEPS_PX = (9.0, 7.0, 5.0, 3.0, 2.0, 1.0)
@@ -26,11 +24,12 @@ SEARCH_STEPS_PX = (9.0, 7.0, 5.0, 3.0, 2.0, 1.0)
 
 @dataclass(frozen=True)
 class Estimate:
-    """Pose of the object in one frame, how sure it is in [0, 1], and whether the object is in view."""
+    """Pose of the object in one frame, how sure it is in [0, 1], whether the object is in view, and its outline."""
 
     T_camera_object: Array
     confidence: float
     visible: bool
+    outline: Outline | None = None
 
 
 class ObjectTracker:
@@ -65,12 +64,9 @@ class ObjectTracker:
         else:
             self._before = self._pose
             best = Estimate(self._pose, best.confidence, False)
-        if best.confidence >= LEARN_ABOVE:
-            shape = (rgb.shape[0], rgb.shape[1])
-            outline = extract_outline(self.mesh, best.T_camera_object, self.camera_matrix, shape)
-            if outline is not None:
-                self.colours.update(outline, self.mesh, bins, LEARNING_RATE)
-        return best
+        if best.confidence >= LEARN_ABOVE and best.outline is not None:
+            self.colours.update(best.outline, self.mesh, bins, LEARNING_RATE)
+        return replace(best, outline=None)  # a clip's worth of outlines would be kept otherwise
 
     def _predicted(self) -> Array:
         """Constant velocity, damped."""
@@ -92,26 +88,29 @@ class ObjectTracker:
             self.mesh, start, self.camera_matrix, bins, self.colours, steps_px=steps_px,
             prior_rotation_rad=0.03 * freedom, prior_spin_rad=0.02 * freedom,
             prior_translation=0.02 * freedom, prior_depth=0.01 * freedom,
-            edges=strength if TRACK_EDGES else None,
+            edges=strength,
         )  # fmt: skip
         T = result.T_camera_object
-        height, width = bins.shape
-        in_view = self._share_in_view(T, width, height)
-        if in_view < 0.1:
+        in_view = self._share_in_view(T, bins.shape[1], bins.shape[0])
+        outline = extract_outline(self.mesh, T, self.camera_matrix, (bins.shape[0], bins.shape[1]))
+        if in_view < 0.1 or outline is None:
             return Estimate(T, 0.0, False)
-        return Estimate(T, self._confidence(T, bins, strength) * min(1.0, 2 * in_view), True)
+        confidence = self._confidence(T, outline, bins, strength) * min(1.0, 2 * in_view)
+        return Estimate(T, confidence, True, outline)
 
-    def _confidence(self, T: Array, bins: NDArray[np.int32], strength: NDArray[np.float32]) -> float:
+    def _confidence(self, T: Array, outline: Outline, bins: NDArray[np.int32], strength: NDArray[np.float32]) -> float:
         """Mean of two shares: lines whose colours put the outline within 2 px of it, and outline on image edges."""
-        lines = measure(self.mesh, T, self.camera_matrix, bins, self.colours, 1.0)
+        lines = measure(self.mesh, T, self.camera_matrix, bins, self.colours, 1.0, outline=outline)
         if lines is None:
             return 0.0
         offset_px, _ = lines.residuals(T, self.camera_matrix)
         agree = np.mean((np.abs(offset_px) < 2.0) & (lines.variance_px2 < 9.0))
-        return float(0.5 * agree + 0.5 * edge_score(self.mesh, T, self.camera_matrix, strength))
+        return float(0.5 * agree + 0.5 * share_on_edges(outline, strength))
 
     def _share_in_view(self, T: Array, width: int, height: int) -> float:
-        window = render_depth(self.mesh.vertices_m, self.mesh.faces, T, self.camera_matrix)
-        if window is None:
+        """Share of the mesh's vertices that project into the image."""
+        points = transform_points(T, self.mesh.vertices_m)
+        if points[:, 2].min() < 1e-3:
             return 0.0
-        return float(np.count_nonzero(window.mask_in_image(width, height)) / max(np.count_nonzero(window.mask), 1))
+        x, y = project(self.camera_matrix, points).T
+        return float(np.mean((x >= 0) & (x < width) & (y >= 0) & (y < height)))
