@@ -8,7 +8,7 @@ frames: the poses are each frame's own, the shape is shared.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -19,7 +19,7 @@ from .geometry import Array, project, transform_points
 from .raster import render_depth
 from .region import ColourModel, Lines, TrackingMesh, measure
 from .segment import Box
-from .vessels import Vessel, make_vessel, parameter_space
+from .vessels import Vessel, make_vessel, outline_mesh, parameter_space
 
 FIXED = ("wall_m", "red", "green", "blue")  # not seen in a silhouette
 PRIOR_SHARE = 0.15  # standard deviation of a shape parameter around its start, as a share of its range
@@ -40,6 +40,14 @@ class View:
     T_camera_object: Array
     box_xywh_px: Box | None = None
     edges: NDArray[np.float32] | None = None
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Vertices (V, 3) in m and faces (F, 3): all that drawing a silhouette needs."""
+
+    vertices_m: Array
+    faces: NDArray[np.int32]
 
 
 def tracking_mesh(vessel: Vessel, faces: int = TRACKING_FACES) -> TrackingMesh:
@@ -68,7 +76,8 @@ def fit_shape(
     prior_std = PRIOR_SHARE * (high - low)
     values, poses = start.copy(), [view.T_camera_object for view in views]
     for step_px in steps_px:
-        mesh = tracking_mesh(vessel)
+        surface = _surface(vessel.category, {**vessel.params})
+        mesh = TrackingMesh.build(surface.vertices_m, surface.faces)
         measured = [
             measure(mesh, T, camera_matrix, view.bins, view.colours, step_px, view.edges)
             for T, view in zip(poses, views, strict=True)
@@ -78,7 +87,10 @@ def fit_shape(
             break
         nudges = 0.04 * (high - low)
         nudges = np.where(values + nudges > high, -nudges, nudges)
-        variants = [tracking_mesh(_with(vessel, {n: v + d})) for n, v, d in zip(names, values, nudges, strict=True)]
+        variants = [
+            _surface(vessel.category, {**vessel.params, n: float(v + d)})
+            for n, v, d in zip(names, values, nudges, strict=True)
+        ]
         size = 6 * len(used) + len(names)
         normal, gradient = np.zeros((size, size)), np.zeros(size)
         for slot, k in enumerate(used):
@@ -107,14 +119,18 @@ def fit_shape(
         for slot, k in enumerate(used):
             poses[k] = _moved(poses[k], delta[6 * slot : 6 * slot + 6])
         values = np.clip(values + delta[tail], low, high)
-        vessel = _with(vessel, dict(zip(names, values, strict=True)))
-    return vessel, poses
+        vessel = replace(vessel, params={**vessel.params, **dict(zip(names, map(float, values), strict=True))})
+    return _with(vessel, {}), poses
 
 
 def coloured(vessel: Vessel, rgb: NDArray[np.uint8], mask: NDArray[np.bool_]) -> Vessel:
     """The vessel in the median colour of the masked pixels."""
     red, green, blue = np.median(rgb[mask], axis=0) / 255.0
     return _with(vessel, {"red": red, "green": green, "blue": blue})
+
+
+def _surface(category: str, params: dict[str, float]) -> Surface:
+    return Surface(*outline_mesh(category, params))
 
 
 def _with(vessel: Vessel, changes: dict[str, float]) -> Vessel:
@@ -130,7 +146,7 @@ def _moved(T: Array, delta: Array) -> Array:
 
 def _shape_jacobian(
     mesh: TrackingMesh,
-    variants: Sequence[TrackingMesh],
+    variants: Sequence[Surface],
     nudges: Array,
     lines: Lines,
     T: Array,
@@ -147,7 +163,7 @@ def _shape_jacobian(
 
 def _box_rows(
     mesh: TrackingMesh,
-    variants: Sequence[TrackingMesh],
+    variants: Sequence[Surface],
     nudges: Array,
     T: Array,
     camera_matrix: Array,
@@ -162,12 +178,12 @@ def _box_rows(
     return target - here, np.stack(pose, axis=1), np.stack(shape, axis=1)
 
 
-def _projected_sides(mesh: TrackingMesh, T: Array, camera_matrix: Array) -> Array:
+def _projected_sides(mesh: Surface | TrackingMesh, T: Array, camera_matrix: Array) -> Array:
     pixels = project(camera_matrix, transform_points(T, mesh.vertices_m))
     return np.concatenate([pixels.min(axis=0), pixels.max(axis=0)])
 
 
-def _signed_distance(mesh: TrackingMesh, T: Array, camera_matrix: Array, pixel: Array) -> Array:
+def _signed_distance(mesh: Surface | TrackingMesh, T: Array, camera_matrix: Array, pixel: Array) -> Array:
     """Distance of pixels (N, 2) from the silhouette's outline in px, positive outside, limited to +-20."""
     window = render_depth(mesh.vertices_m, mesh.faces, T, camera_matrix, margin_px=24)
     if window is None:

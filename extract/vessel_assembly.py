@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 
 import manifold3d
 import numpy as np
+from numpy.typing import NDArray
 
 from .geometry import Array, Symmetry
 from .vessel_shapes import (
@@ -356,6 +357,24 @@ def assemble(category: str, params: Mapping[str, float], draft: Draft) -> Vessel
         color_rgba=draft.rgba,
         extents_m=(extent_x, extent_y, extent_z),
     )
+
+
+def outline_surfaces(draft: Draft) -> tuple[Array, NDArray[np.int32]]:
+    """Vertices (V, 3) in m and faces (F, 3) with the vessel's silhouette, in its frame.
+
+    Dents and cuts lie inside the silhouette and are left out. The parts lie in one another instead of being joined and hollowed out, which takes a tenth of the time: for fits
+    that draw hundreds of shapes.
+    """
+    walls = draft.walls
+    shell = lofted(walls.outer, walls.corner_outer, walls.aspect, walls.lip, walls.height_m, walls.sides)
+    vertices, faces, count = [], [], 0
+    for solid in (shell, *(part.solid for part in draft.additions)):
+        raw = solid.to_mesh64()
+        vertices.append(np.asarray(raw.vert_properties[:, :3], np.float64))
+        faces.append(np.asarray(raw.tri_verts, np.int32) + count)
+        count += len(vertices[-1])
+    points = np.concatenate(vertices)
+    return points - 0.5 * (points.min(axis=0) + points.max(axis=0)), np.concatenate(faces)
 
 
 def _profile(points: Array, corner: Array | None, aspect: float) -> Profile:

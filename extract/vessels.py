@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 from . import vessel_containers as containers
 from . import vessel_cups as cups
@@ -15,7 +16,8 @@ from . import vessel_kettles as kettles
 from . import vessel_pitchers as pitchers
 from . import vessel_pots as pots
 from .errors import UserError
-from .vessel_assembly import STEEL, Draft, assemble
+from .geometry import Array
+from .vessel_assembly import STEEL, Draft, assemble, outline_surfaces
 from .vessel_types import Color, GraspRegion, Outlet, Profile, Range, Section, Vessel
 
 __all__ = [
@@ -27,6 +29,7 @@ __all__ = [
     "Section",
     "Vessel",
     "make_vessel",
+    "outline_mesh",
     "parameter_space",
     "resolve_category",
 ]
@@ -114,6 +117,15 @@ def make_vessel(category: str, seed: int | None = None, **params: float) -> Vess
     vessel = _build(category, tuple(values.items()))
     # The cached mesh stays out of the callers' hands, who may move or scale theirs.
     return replace(vessel, mesh=vessel.mesh.copy(), params=dict(vessel.params))
+
+
+def outline_mesh(category: str, params: Mapping[str, float]) -> tuple[Array, NDArray[np.int32]]:
+    """Vertices (V, 3) and faces (F, 3) of surfaces with the silhouette of `make_vessel(category, **params)`.
+
+    params: the full set, within the limits. Not watertight, and much faster.
+    """
+    rgba = (params["red"], params["green"], params["blue"], 1.0)
+    return outline_surfaces(_entry(category).draft(params, rgba))
 
 
 def resolve_category(word: str) -> tuple[str, ...]:

@@ -9,11 +9,22 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from vid2demo.extract.errors import UserError
+from vid2demo.extract.first_pose import upright_rotation
+from vid2demo.extract.geometry import focal_prior_camera_matrix, make_pose
 from vid2demo.extract.meshes import load_mesh, mesh_sha256
+from vid2demo.extract.raster import render_depth
 from vid2demo.extract.vessel_output import contact_sheet, export_vessel, library_table
 from vid2demo.extract.vessel_shapes import Solid, stacked_rings
 from vid2demo.extract.vessel_types import Profile, Section
-from vid2demo.extract.vessels import CATEGORIES, Vessel, _build, make_vessel, parameter_space, resolve_category
+from vid2demo.extract.vessels import (
+    CATEGORIES,
+    Vessel,
+    _build,
+    make_vessel,
+    outline_mesh,
+    parameter_space,
+    resolve_category,
+)
 
 SEEDS = (None, 1)
 every_vessel = pytest.mark.parametrize(
@@ -356,3 +367,15 @@ def test_contact_sheet_shows_every_vessel(tmp_path):
     for x in (0, 96):
         for y in (0, 96):
             assert image[y + 20 : y + 96, x : x + 96].std() > 10
+
+
+@pytest.mark.parametrize("category", CATEGORIES)
+def test_outline_mesh_has_the_silhouette_of_the_vessel(category: str) -> None:
+    vessel = make_vessel(category, seed=7)
+    camera = focal_prior_camera_matrix(320, 240)
+    meshes = [(np.asarray(vessel.mesh.vertices, float), np.asarray(vessel.mesh.faces, np.int32))]
+    meshes.append(outline_mesh(category, vessel.params))
+    for elevation, yaw, roll in ((20, 30, 0), (45, 140, 0), (10, -70, 90)):
+        T = make_pose(upright_rotation(elevation, yaw, roll), (0.0, 0.0, 0.8))
+        a, b = (render_depth(v, f, T, camera).mask_in_image(320, 240) for v, f in meshes)
+        assert np.count_nonzero(a & b) / np.count_nonzero(a | b) > 0.995
