@@ -1,0 +1,30 @@
+"""A person's pour, filmed: the track against what can be read off the frames by eye. Needs ../shared."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from vid2demo.extract.perceive import ObjectRequest, extract
+
+COFFEE = Path(__file__).parents[2].parent / "shared" / "data" / "videos" / "coffee_pour.mp4"
+KETTLE_BOX_PX = (345.0, 297.0, 488.0, 342.0)
+# Frame -> tilt of the kettle's body in the image, from the slopes of its base and rim, +-2 degrees.
+TILT_BY_EYE_DEG = {
+    0: 0.0, 10: 7.0, 20: 22.5, 32: 33.5, 60: 46.3, 90: 49.5,
+    120: 54.5, 150: 55.0, 180: 55.5, 210: 59.5, 240: 58.0, 270: 54.8,
+}  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+@pytest.mark.skipif(not COFFEE.exists(), reason=f"needs the recording {COFFEE}")
+def test_the_kettle_of_a_filmed_pour_tilts_as_read_by_eye(tmp_path: Path) -> None:
+    track = extract(COFFEE, [ObjectRequest("kettle", KETTLE_BOX_PX)], out=tmp_path)["kettle"]
+    up = track.T_camera_object[:, :3, 2]
+    tilt_deg = np.rad2deg(np.arctan2(up[:, 0], -up[:, 1]))
+    errors_deg = np.abs([tilt_deg[frame] - by_eye for frame, by_eye in TILT_BY_EYE_DEG.items()])
+    assert len(track) > max(TILT_BY_EYE_DEG)
+    assert track.visible.all()
+    assert errors_deg.mean() < 6.0, errors_deg
