@@ -362,8 +362,8 @@ def assemble(category: str, params: Mapping[str, float], draft: Draft) -> Vessel
 def outline_surfaces(draft: Draft) -> tuple[Array, NDArray[np.int32]]:
     """Vertices (V, 3) in m and faces (F, 3) with the vessel's silhouette, in its frame.
 
-    Dents and cuts lie inside the silhouette and are left out. The parts lie in one another instead of being joined and hollowed out, which takes a tenth of the time: for fits
-    that draw hundreds of shapes.
+    Dents and cuts lie inside the silhouette and are left out, and the parts lie in one another instead of being
+    joined and hollowed out. That takes a tenth of the time, for fits that draw hundreds of shapes.
     """
     walls = draft.walls
     shell = lofted(walls.outer, walls.corner_outer, walls.aspect, walls.lip, walls.height_m, walls.sides)
