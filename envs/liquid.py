@@ -184,12 +184,12 @@ class SpoutConduit:
         return np.vstack([np.zeros((1, 3)), ring_m * (np.cos(angle) * u + np.sin(angle) * v)])
 
     def _clear_of(self, boxes: list[Box], slots_m: Array) -> Array:
-        """Slots moved out along the outlet by a radius, and on until they clear the walls of a spout close to the body."""
+        """Slots moved out along the outlet by a radius, and on until they clear walls close to the spout."""
         for out_m in self._radius_m + np.linspace(0.0, 0.03, 31):
             moved = slots_m + out_m * self._direction
             if min(box.distance_m(moved).min() for box in boxes) >= self._radius_m:
                 break
-        return moved
+        return np.asarray(moved)
 
     def level_m(self, T_world_vessel: Array, held: int) -> float:
         """Height in the world of the surface of the liquid that `held` particles stand for; -inf when there is none."""

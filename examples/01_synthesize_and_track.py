@@ -1,6 +1,6 @@
 """Render a clip with exact truth, follow its vessel and print how far off the track is.
 
-    python examples/01_synthesize_and_track.py [OUT]
+python examples/01_synthesize_and_track.py [OUT]
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """From a track to a Panda motion, played in the Gymnasium environment.
 
-    python examples/02_track_to_robot.py [TRACK]      # a *.track.npz; default: the one of example 01
+python examples/02_track_to_robot.py [TRACK]      # a *.track.npz; default: the one of example 01
 """
 
 from __future__ import annotations

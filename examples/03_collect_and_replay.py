@@ -1,6 +1,6 @@
 """Collect verified demonstrations as a LeRobot dataset, replay them, and evaluate the open-loop policy.
 
-    python examples/03_collect_and_replay.py [REFERENCE]   # a *.reference.npz; default: the one of example 02
+python examples/03_collect_and_replay.py [REFERENCE]   # a *.reference.npz; default: the one of example 02
 """
 
 from __future__ import annotations
