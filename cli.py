@@ -349,11 +349,12 @@ class Demo(Staged):
         clip = self.out / "clip"
         chosen: dict[str, Any] = {"category": self.category, "receptacle": self.receptacle, "seconds": self.seconds}
         Synthesize(out=clip, seed=self.seed, force=self.force, **chosen).do()
-        camera = json.loads((clip / "settings.json").read_text(encoding="utf-8"))["camera_matrix"]
+        truth = json.loads((clip / "settings.json").read_text(encoding="utf-8"))
+        camera, box = truth["camera_matrix"], truth["boxes_xywh_px"]["receptacle"]
         settings = RunSettings(
             clip / "video.mp4",
             ObjectSettings(self.category),
-            ObjectSettings(self.receptacle),
+            ObjectSettings(self.receptacle, (box[0], box[1], box[2], box[3])),
             camera=(camera[0][0], camera[1][1], camera[0][2], camera[1][2]),
             episodes=self.episodes,
             seed=self.seed,
