@@ -26,6 +26,7 @@ from .video import Image
 
 GLIMPSES = 60  # frames kept for the spin
 FIT_VIEWS = 6  # frames that the shape is fitted to
+SECOND_LOOK_RAD = np.deg2rad(60)  # most that a second look at the spin may change: it mends, it does not turn round
 SURE = 0.35  # least confidence of a frame that the shape may be fitted to
 
 
@@ -94,17 +95,17 @@ class Followed:
             vessel, shift = self._fitted(poses, vessel)
             if vessel is not self.vessel:
                 # A handle of the right size shows its side in frames where one of the wrong size did not.
-                mesh, poses = tracking_mesh(vessel), self._with_settled_spin(poses @ shift, vessel)
+                mesh, poses = tracking_mesh(vessel), self._with_settled_spin(poses @ shift, vessel, SECOND_LOOK_RAD)
         return Followed.start(mesh, vessel, self.camera_matrix, first_rgb, self.first_mask, poses[0], poses)
 
-    def _with_settled_spin(self, poses: Array, vessel: Vessel) -> Array:
+    def _with_settled_spin(self, poses: Array, vessel: Vessel, within_rad: float = np.pi) -> Array:
         if vessel.symmetry.order == 0 or len(self.glimpses) < 2:
             return poses
         axis = vessel.interior.axis_xy_m
         camera = np.diag([0.5, 0.5, 1.0]) @ self.camera_matrix
         light = tracking_mesh(vessel, 3000)
         scores = [spin_scores(light, poses[g.index], camera, g.evidence, axis) for g in self.glimpses]
-        angles = best_spins(np.stack(scores))
+        angles = best_spins(np.stack(scores), within_rad)
         every = np.interp(np.arange(len(poses)), [g.index for g in self.glimpses], angles)
         return np.stack([spun(T, angle, axis) for T, angle in zip(poses, every, strict=True)])
 

@@ -249,16 +249,12 @@ def _start(
         raise _not_found(request, info, f"the best silhouette covers only {ranked[0][0].iou:.0%} of what was found")
     edges = edge_strength(rgb)
     band_px = max(3, round(RECUT_BAND * max(box[2], box[3])))
-    # Each hypothesis gets one round, which is enough to tell them apart; the best one gets the rest.
     mask = _resized(small_mask, rgb)
     fits = [
-        _fitted(model, pose, rgb, edges, box, source, camera_matrix, band_px, mask, 1)
+        _fitted(model, pose, rgb, edges, box, source, camera_matrix, band_px, mask)
         for pose, model in ranked[:HYPOTHESES]
     ]
     model, pose, evidence = max(fits, key=lambda fit: fit[1].merit)
-    model, pose, evidence = _fitted(
-        model, pose, rgb, edges, box, source, camera_matrix, band_px, evidence, FIT_ROUNDS - 1
-    )
     T = pose.T_camera_object
     silhouette = _silhouette(model.mesh, T, camera_matrix, rgb.shape)
     mask = _evidence(model.mesh, rgb, T, camera_matrix, evidence, band_px) & silhouette
@@ -277,13 +273,12 @@ def _fitted(
     camera_matrix: Array,
     band_px: int,
     mask: Mask,
-    rounds: int,
 ) -> tuple[_Model, PoseCandidate, Mask]:
     """One hypothesis carried on: the vessel's shape and pose fitted to the mask re-cut near its silhouette."""
     T = pose.T_camera_object
     evidence = _evidence(model.mesh, rgb, T, camera_matrix, mask, band_px)
     pose = judge(model.mesh, T, camera_matrix, rgb, evidence, box)
-    for _ in range(rounds if model.vessel is not None else 0):
+    for _ in range(FIT_ROUNDS if model.vessel is not None else 0):
         assert model.vessel is not None
         view = View(*mask_evidence(evidence), T, box if source == "given" else None, edges)
         vessel, (T_fitted,) = fit_shape(model.vessel, [view], camera_matrix)

@@ -48,8 +48,13 @@ def spin_scores(
     return totals / max(float(areas.mean()), 1.0)
 
 
-def best_spins(scores: Array) -> Array:
-    """(M,) spins in rad, continuous over the M samples, that maximise the summed scores (M, SPINS) less the turning."""
+def best_spins(scores: Array, within_rad: float = np.pi) -> Array:
+    """(M,) spins in rad, continuous over the M samples, that maximise the summed scores (M, SPINS) less the turning.
+
+    within_rad: no spin is farther than this from none.
+    """
+    angle_rad = 2 * np.pi * np.minimum(np.arange(SPINS), SPINS - np.arange(SPINS)) / SPINS
+    scores = np.where(angle_rad <= within_rad + 1e-9, scores, -np.inf)
     step = np.abs((np.arange(SPINS)[:, None] - np.arange(SPINS)[None] + SPINS // 2) % SPINS - SPINS // 2)
     cost = TURN_COST * np.minimum(step, 6) ** 2
     total, back = scores[0].copy(), np.zeros(scores.shape, int)

@@ -63,7 +63,7 @@ class ObjectTracker:
             self._before, self._pose = self._pose, best.T_camera_object
         else:
             self._before = self._pose
-            best = Estimate(self._pose, best.confidence, False)
+            best = Estimate(self._pose if guess is None else guess, best.confidence, False)
         if best.confidence >= LEARN_ABOVE and best.outline is not None:
             self.colours.update(best.outline, self.mesh, bins, LEARNING_RATE)
         return replace(best, outline=None)  # a clip's worth of outlines would be kept otherwise
