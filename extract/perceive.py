@@ -35,6 +35,7 @@ from .video import Image, VideoInfo, iterate_frames, read_video_info
 WORKING_SIDE_PX = 640  # tracking
 STARTING_SIDE_PX = 1280  # the first frame, where thin parts such as spouts must be seen to be fitted
 SMOOTHING_BANDWIDTH_S = 0.06
+TRUSTED_CONFIDENCE = 0.5  # mean over the clip, of an object that nobody pointed at
 FOUND_IOU = 0.45  # below this no pose of the mesh explains what was cut out of the first frame
 HYPOTHESES = 4  # first poses, far from each other, that a shape is fitted to
 HYPOTHESES_WITHIN = 0.5  # of the best one's merit
@@ -151,6 +152,9 @@ def extract(
         if visible.mean() < 0.1:
             raise _not_found(request, info, f"it was lost after {int(visible.sum())} of {len(visible)} frames")
         confidence = np.array([e.confidence for e in found])
+        if start is starts[0] and start.box_source == "found" and confidence.mean() < TRUSTED_CONFIDENCE:
+            what = f"what looked most like it was followed with a confidence of {confidence.mean():.0%} only"
+            raise _not_found(request, info, what)
         raw = np.stack([e.T_camera_object for e in found])
         time_s = np.array([times[k] for k in range(len(found))])
         model = start.model if result.vessel is None else _vessel_model(result.vessel)

@@ -6,9 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from vid2demo.extract.errors import UserError
 from vid2demo.extract.perceive import ObjectRequest, extract
 
-COFFEE = Path(__file__).parents[2].parent / "shared" / "data" / "videos" / "coffee_pour.mp4"
+VIDEOS = Path(__file__).parents[2].parent / "shared" / "data" / "videos"
+COFFEE, BOX_TURN = VIDEOS / "coffee_pour.mp4", VIDEOS / "box_turn.mp4"
 KETTLE_BOX_PX = (345.0, 297.0, 488.0, 342.0)
 # Frame -> tilt of the kettle's body in the image, from the slopes of its base and rim, +-2 degrees.
 TILT_BY_EYE_DEG = {
@@ -28,3 +30,11 @@ def test_the_kettle_of_a_filmed_pour_tilts_as_read_by_eye(tmp_path: Path) -> Non
     assert len(track) > max(TILT_BY_EYE_DEG)
     assert track.visible.all()
     assert errors_deg.mean() < 6.0, errors_deg
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+@pytest.mark.skipif(not BOX_TURN.exists(), reason=f"needs the recording {BOX_TURN}")
+def test_a_teapot_is_not_found_where_a_box_is_turned(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="'teapot' was not found"):
+        extract(BOX_TURN, [ObjectRequest("teapot")], out=tmp_path)
