@@ -10,9 +10,10 @@ import numpy as np
 
 from ..extract.errors import UserError
 from ..extract.geometry import Array
+from .cameras import CAMERAS
 from .observations import resampled
 from .reference import Reference
-from .scene import CAMERAS, MAX_PICTURE_PX
+from .scene import MAX_PICTURE_PX
 
 MAX_PARTICLES = 500
 # Longer steps let particles leak through walls.
