@@ -1,4 +1,4 @@
-"""The liquid: spheres that slide without friction; how they are laid into a vessel, counted, and led through a spout.
+"""The liquid: spheres that slide and do not roll; how they are laid into a vessel, counted, and led through a spout.
 
 Each particle is a body at the world's origin on three slide joints, so its joint positions are its world position.
 """
@@ -26,6 +26,13 @@ MIN_RADIUS_M, MAX_RADIUS_M = 0.0025, 0.005
 GRAVITY_M_S2 = 9.81
 # Points that stand for the hollow when the liquid's level is sought: 1 mm in 10 cm or better.
 LEVEL_SAMPLES = 2000
+SOLVERS = ("engine", "fast")
+_RANGES = {
+    "density_kg_m3": (50.0, 20000.0),
+    "friction": (0.0, 2.0),
+    "drag_1_s": (0.0, 20.0),
+    "spout_fill": (0.0, 0.9),
+}
 
 
 @dataclass(frozen=True)
@@ -34,26 +41,35 @@ class Liquid:
 
     radius_m: particle radius; None chooses 2.5 to 5 mm so that the particles take up a fair part of the vessel but
         not more than half of the receptacle: ten millilitres at the bottom of a kettle would never reach its spout.
-    particle_mass_kg: mass of one particle.
-    drag_kg_s: resistance of the air, so that what was spilled comes to rest at last.
+    density_kg_m3: of a particle, which weighs as much as a ball of it.
+    friction: Coulomb's coefficient at every contact of a particle; 0 lets them slide freely.
+    drag_1_s: resistance of the air: the part of its speed that a particle loses in a second, so that what was spilled
+        comes to rest at last.
     spout_fill: share of a spouted vessel's hollow that the particles stand for while its level is sought; their own
         volume where that is more. A few particles in a kettle behave as the kettle filled so far would.
+    solver: "engine": the particles are bodies of the simulated scene; "fast": `fast_liquid.FastLiquid` moves them.
     """
 
     radius_m: float | None = None
-    particle_mass_kg: float = 0.0005
-    drag_kg_s: float = 0.0001
+    density_kg_m3: float = 1000.0
+    friction: float = 0.0
+    drag_1_s: float = 0.2
     spout_fill: float = 0.25
+    solver: str = "engine"
 
     def __post_init__(self) -> None:
         if self.radius_m is not None and not 0.002 <= self.radius_m <= 0.01:
             raise UserError(f"liquid radius_m is {self.radius_m}; choose 0.002 to 0.01 m, or None for a fitting one")
-        if not 1e-5 <= self.particle_mass_kg <= 0.05:
-            raise UserError(f"liquid particle_mass_kg is {self.particle_mass_kg}; choose 1e-5 to 0.05 kg")
-        if not 0.0 <= self.drag_kg_s <= 0.01:
-            raise UserError(f"liquid drag_kg_s is {self.drag_kg_s}; choose 0 to 0.01 kg/s")
-        if not 0.0 <= self.spout_fill <= 0.9:
-            raise UserError(f"liquid spout_fill is {self.spout_fill}; choose 0 to 0.9")
+        for name, (low, high) in _RANGES.items():
+            value = getattr(self, name)
+            if not low <= value <= high:
+                raise UserError(f"liquid {name} is {value}; choose {low:g} to {high:g}")
+        if self.solver not in SOLVERS:
+            raise UserError(f"liquid solver is {self.solver!r}; choose {', '.join(SOLVERS)}")
+
+    def particle_mass_kg(self, radius_m: float) -> float:
+        """Mass of one particle of this radius."""
+        return self.density_kg_m3 * 4 / 3 * math.pi * radius_m**3
 
     def radius_for(self, count: int, vessel_m3: float, receptacle_m3: float, throat_m: float) -> float:
         """The radius in m that `count` particles take in a vessel and a receptacle of these volumes.
@@ -235,12 +251,13 @@ def add_particles(
 ) -> None:
     """Add `count` particles to a spec: bodies `particle_I` with slide joints `particle_I_x|y|z`."""
     axes = (("x", [1, 0, 0]), ("y", [0, 1, 0]), ("z", [0, 0, 1]))
+    mass_kg = liquid.particle_mass_kg(radius_m)
     for i in range(count):
         body = spec.worldbody.add_body(name=f"particle_{i}")
-        body.mass, body.inertia = liquid.particle_mass_kg, [1e-8, 1e-8, 1e-8]
+        body.mass, body.inertia = mass_kg, [1e-8, 1e-8, 1e-8]
         body.explicitinertial = True
         for name, axis in axes:
             joint = body.add_joint(name=f"particle_{i}_{name}", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
-            joint.damping = np.array([liquid.drag_kg_s, 0.0, 0.0])
+            joint.damping = np.array([liquid.drag_1_s * mass_kg, 0.0, 0.0])
         geom = body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[radius_m, 0, 0], rgba=rgba, **contact)
         geom.group = 1

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -58,14 +60,21 @@ def test_chosen_radius_suits_both_vessels() -> None:
     ("values", "message"),
     [
         ({"radius_m": 0.1}, "radius_m"),
-        ({"particle_mass_kg": 0.0}, "particle_mass"),
-        ({"drag_kg_s": -1.0}, "drag"),
+        ({"density_kg_m3": 0.0}, "density_kg_m3 is 0.0; choose 50 to 20000"),
+        ({"friction": -0.1}, "friction"),
+        ({"drag_1_s": -1.0}, "drag"),
         ({"spout_fill": 2.0}, "spout_fill"),
+        ({"solver": "magic"}, "solver is 'magic'; choose engine, fast"),
     ],
 )
-def test_impossible_liquids_are_refused(values: dict[str, float], message: str) -> None:
+def test_impossible_liquids_are_refused(values: dict[str, Any], message: str) -> None:
     with pytest.raises(UserError, match=message):
         Liquid(**values)
+
+
+def test_a_particle_weighs_what_a_ball_of_its_density_does() -> None:
+    assert Liquid().particle_mass_kg(0.005) == pytest.approx(0.0005236, rel=1e-3)
+    assert Liquid(density_kg_m3=500.0).particle_mass_kg(0.01) == pytest.approx(0.0020944, rel=1e-3)
 
 
 def test_every_particle_is_held_poured_spilled_or_flying() -> None:
