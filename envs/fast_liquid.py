@@ -1,0 +1,152 @@
+"""`FastLiquid`: the particles as position-based dynamics, several times faster than as bodies of the engine.
+
+Spheres of one mass, moved by gravity and drag, kept apart and behind the walls by projecting their positions onto what
+does not overlap; velocities follow from the positions (PBD: Müller et al. 2007, "Position Based Dynamics"; contacts and
+friction as in Macklin et al. 2014, "Unified Particle Physics for Real-Time Applications"; substeps with one sweep each:
+Macklin et al. 2019, "Small Steps in Physics Simulation"). Overlaps that are left over are undone slowly, so that no
+energy comes from them: blows are inelastic, as the engine's are.
+
+Walls are the boxes and cylinders that the engine has as geoms. They are looked up in a grid in the frame of the vessel
+that they belong to, where they do not move.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..extract.errors import UserError
+from ..extract.geometry import Array
+from . import fast_liquid_kernels as kernels
+from .liquid import Liquid
+from .vessel_geometry import Box
+
+SUBSTEPS = 4
+# How far a particle may move against a vessel in a step and still find its walls in the grid, and the grid's cells.
+REACH_M, CELL_M = 0.004, 0.005
+# The vessel feels the particles' push through a filter of this time constant: a step's blows are not smooth.
+FILTER_S = 0.01
+
+
+class FastLiquid:
+    """Particles in a held vessel, a receptacle and a surrounding that stands still.
+
+    positions_m, velocities_m_s: (N, 3) in the world, may be written to between steps. wrench: (6,) what the particles
+    put on the held vessel, filtered: force in N, torque about its origin in N m, world axes.
+    """
+
+    def __init__(
+        self,
+        vessel_boxes: list[Box],
+        receptacle_boxes: list[Box],
+        static_shapes: list[Box],
+        count: int,
+        radius_m: float,
+        liquid: Liquid,
+        timestep_s: float,
+    ) -> None:
+        """Boxes in the frames of their vessels, static shapes in the world. A step lasts `timestep_s`."""
+        if count < 1:
+            raise UserError(f"a liquid of {count} particles cannot be simulated; give 1 or more")
+        self.radius_m, self.timestep_s = radius_m, timestep_s
+        self.positions_m: Array = np.zeros((count, 3))
+        self.velocities_m_s: Array = np.zeros((count, 3))
+        self.wrench: Array = np.zeros(6)
+        mass_kg = liquid.particle_mass_kg(radius_m)
+        h = timestep_s / SUBSTEPS
+        # From a sum of ways in substeps to a mean force of the particles on the vessel.
+        self._force = -mass_kg / h / timestep_s
+        self._filter = -math.expm1(-timestep_s / FILTER_S)
+        self._numbers = (radius_m, timestep_s, liquid.friction, liquid.drag_1_s, SUBSTEPS)
+        groups = [vessel_boxes, receptacle_boxes, static_shapes]
+        self._walls = _walls(groups, radius_m + REACH_M)
+        self._poses: Array = np.tile(np.eye(4), (len(groups), 2, 1, 1))
+        buckets = 1 << max(6, (2 * count - 1).bit_length())
+        self._last: Array = np.zeros((count, 3))
+        self._pairs = np.zeros((kernels.MAX_PAIRS * count, 2), np.int32)
+        self._grid = (np.zeros((count, 4), np.int32), np.zeros(buckets + 1, np.int32), np.zeros(count, np.int32))
+        self._which = np.zeros((kernels.MAX_CONTACTS * count, 2), np.int32)
+        self._contacts: Array = np.zeros((kernels.MAX_CONTACTS * count, kernels.CONTACT_WIDTH))
+        self._moved: Array = np.zeros(6)
+
+    def place(self, positions_m: Array) -> None:
+        """Put the particles at (N, 3) in the world, at rest."""
+        self.positions_m[:] = positions_m
+        self.velocities_m_s[:] = 0.0
+        self.wrench[:] = 0.0
+
+    def step(self, T_world_vessel_before: Array, T_world_vessel_after: Array, T_world_receptacle: Array) -> Array:
+        """Advance by one step in which the vessel goes from one pose (4, 4) to the other; `wrench`."""
+        poses = self._poses
+        poses[0, 0], poses[0, 1], poses[1] = T_world_vessel_before, T_world_vessel_after, T_world_receptacle
+        kernels.advance(
+            self.positions_m,
+            self.velocities_m_s,
+            self._last,
+            poses,
+            *self._walls,
+            self._pairs,
+            self._grid,
+            self._which,
+            self._contacts,
+            self._moved,
+            self._numbers,
+        )
+        self.wrench += self._filter * (self._force * self._moved - self.wrench)
+        return self.wrench
+
+    def settle(self, T_world_vessel: Array, T_world_receptacle: Array, duration_s: float) -> None:
+        """Let the particles come to rest while nothing else moves."""
+        for _ in range(round(duration_s / self.timestep_s)):
+            self.step(T_world_vessel, T_world_vessel, T_world_receptacle)
+
+    def get_state(self) -> Array:
+        """(6 N + 6,) everything that the next steps depend on."""
+        return np.concatenate([self.positions_m.ravel(), self.velocities_m_s.ravel(), self.wrench])
+
+    def set_state(self, state: Array) -> None:
+        """Continue exactly where `get_state()` was called."""
+        size = self.positions_m.size
+        if state.shape != (2 * size + 6,):
+            raise UserError(
+                f"the state of the liquid holds {state.size} values, {2 * size + 6} are needed for "
+                f"{len(self.positions_m)} particles; it was taken with another number of them"
+            )
+        self.positions_m[:] = state[:size].reshape(-1, 3)
+        self.velocities_m_s[:] = state[size : 2 * size].reshape(-1, 3)
+        self.wrench[:] = state[2 * size :]
+
+
+def _walls(
+    groups: list[list[Box]], reach_m: float
+) -> tuple[Array, NDArray[np.int32], Array, NDArray[np.int32], NDArray[np.int32]]:
+    """The shapes of all groups as the kernels take them, and the grids in which they are looked up.
+
+    Shapes (B, 16); for each group (G, 6) its first shape, the one after its last, where its cells begin in `starts`
+    and how many cells it has along each axis; for each group (G, 5) its grid's corner, cell size and reach, all in m;
+    `starts` into `items`, the numbers of the shapes near a cell. What stands still, the last group, is few and wide:
+    it has no grid, its reach is 0.
+    """
+    shapes = np.array(
+        [[*box.center_m, *box.R.ravel(), *box.half_m, float(box.round)] for boxes in groups for box in boxes]
+    )
+    ends = np.cumsum([len(boxes) for boxes in groups])
+    ranges, grids = np.zeros((len(groups), 6), np.int32), np.zeros((len(groups), 5))
+    starts, items = [np.zeros(0, np.int32)], [np.zeros(0, np.int32)]
+    for g, boxes in enumerate(groups):
+        first = ends[g] - len(boxes)
+        ranges[g, :2] = first, ends[g]
+        if g == len(groups) - 1:
+            continue
+        spans = np.array([np.linalg.norm(box.half_m) for box in boxes])[:, None] + reach_m
+        centers = np.array([box.center_m for box in boxes])
+        low, high = (centers - spans).min(axis=0), (centers + spans).max(axis=0)
+        size = np.ceil((high - low) / CELL_M).astype(np.int32)
+        begin, found = kernels.shapes_by_cell(shapes[first : ends[g]], low, CELL_M, size, reach_m)
+        ranges[g, 2], ranges[g, 3:] = sum(map(len, starts)), size
+        grids[g] = [*low, CELL_M, REACH_M]
+        starts.append(begin + sum(map(len, items)))
+        items.append(found + first)
+    return shapes, ranges, grids, *(np.concatenate(parts).astype(np.int32) for parts in (starts, items))

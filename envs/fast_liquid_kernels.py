@@ -1,0 +1,429 @@
+"""Compiled loops of `FastLiquid`: neighbours, contacts with moving walls, and the projection of both.
+
+Shapes are rows of 16 numbers: centre (3), rotation (9, row by row), half extents (3), 1 for a cylinder about its z. They
+come in groups that move as one: the held vessel, the receptacle, what stands still. Every loop runs in a fixed order
+and nothing is summed in parallel, so equal input gives equal bits.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from ..extract.geometry import Array
+
+Ints = NDArray[np.int32]
+
+GRAVITY_M_S2 = 9.81
+# Pairs nearer than so many radii are watched through a step: touching, or 2.5 to 5 mm apart.
+PAIR_REACH_RADII = 3.0
+# Contacts are kept ready for what neighbours may push into a wall within a step.
+SLACK_RADII = 0.2
+# A sphere counts as arrived when it is so near to a wall; and so many strides are made on the way to it.
+ARRIVED_RADII, MAX_STRIDES = 0.02, 8
+# Overlaps are undone no faster than this, or the particles would be shot apart.
+PAIR_RECOVERY_M_S, WALL_RECOVERY_M_S = 0.1, 0.2
+MAX_PAIRS, MAX_CONTACTS = 24, 12  # each particle
+CONTACT_WIDTH = 11
+
+
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def nearest(shape: Array, x: float, y: float, z: float) -> tuple[float, float, float, float]:
+    """Signed distance of a point from a shape's surface and the unit vector (3 numbers) that leads away from it."""
+    dx, dy, dz = x - shape[0], y - shape[1], z - shape[2]
+    a = shape[3] * dx + shape[6] * dy + shape[9] * dz
+    b = shape[4] * dx + shape[7] * dy + shape[10] * dz
+    c = shape[5] * dx + shape[8] * dy + shape[11] * dz
+    beyond_c = abs(c) - shape[14]
+    if shape[15] > 0.0:
+        rho = max(math.sqrt(a * a + b * b), 1e-12)
+        beyond = rho - shape[12]
+        if beyond <= 0.0 and beyond_c <= 0.0:
+            across, up = (1.0, 0.0) if beyond > beyond_c else (0.0, 1.0)
+            distance = max(beyond, beyond_c)
+        else:
+            across, up = max(beyond, 0.0), max(beyond_c, 0.0)
+            distance = math.sqrt(across * across + up * up)
+            across, up = across / distance, up / distance
+        a, b, c = across * a / rho, across * b / rho, math.copysign(up, c)
+    else:
+        beyond_a, beyond_b = abs(a) - shape[12], abs(b) - shape[13]
+        distance = max(beyond_a, beyond_b, beyond_c)
+        if distance <= 0.0:
+            a = math.copysign(1.0, a) if beyond_a == distance else 0.0
+            b = math.copysign(1.0, b) if a == 0.0 and beyond_b == distance else 0.0
+            c = math.copysign(1.0, c) if a == 0.0 and b == 0.0 else 0.0
+        else:
+            a = math.copysign(max(beyond_a, 0.0), a)
+            b = math.copysign(max(beyond_b, 0.0), b)
+            c = math.copysign(max(beyond_c, 0.0), c)
+            distance = math.sqrt(a * a + b * b + c * c)
+            a, b, c = a / distance, b / distance, c / distance
+    return (
+        distance,
+        shape[3] * a + shape[4] * b + shape[5] * c,
+        shape[6] * a + shape[7] * b + shape[8] * c,
+        shape[9] * a + shape[10] * b + shape[11] * c,
+    )
+
+
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def within(shape: Array, x: float, y: float, z: float, reach_m: float) -> bool:
+    """Whether a point may lie within `reach_m` of a shape: cheaper than `nearest`, generous at edges and corners."""
+    dx, dy, dz = x - shape[0], y - shape[1], z - shape[2]
+    if abs(shape[5] * dx + shape[8] * dy + shape[11] * dz) > shape[14] + reach_m:
+        return False
+    if abs(shape[3] * dx + shape[6] * dy + shape[9] * dz) > shape[12] + reach_m:
+        return False
+    second = shape[12] if shape[15] > 0.0 else shape[13]
+    return abs(shape[4] * dx + shape[7] * dy + shape[10] * dz) <= second + reach_m
+
+
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def shapes_by_cell(shapes: Array, low: Array, cell_m: float, size: Ints, reach_m: float) -> tuple[Ints, Ints]:
+    """For each cell of a grid the shapes that come within `reach_m` of it: starts (cells + 1,) into items."""
+    starts = np.zeros(size[0] * size[1] * size[2] + 1, np.int32)
+    items = np.zeros(0, np.int32)
+    far = reach_m + 0.5 * math.sqrt(3.0) * cell_m
+    for filling in (False, True):
+        if filling:
+            for cell in range(len(starts) - 1):
+                starts[cell + 1] += starts[cell]
+            items = np.zeros(starts[-1], np.int32)
+            taken = starts.copy()
+        for number in range(len(shapes)):
+            shape = shapes[number]
+            first, last = np.zeros(3, np.int32), np.zeros(3, np.int32)
+            for axis in range(3):
+                row = shape[3 + 3 * axis : 6 + 3 * axis]
+                # A cylinder's second half extent is unused; its first bounds it along both.
+                second = shape[12] if shape[15] > 0.0 else shape[13]
+                half = abs(row[0]) * shape[12] + abs(row[1]) * second + abs(row[2]) * shape[14] + reach_m
+                first[axis] = max(0, int(math.floor((shape[axis] - half - low[axis]) / cell_m)))
+                last[axis] = min(size[axis] - 1, int(math.floor((shape[axis] + half - low[axis]) / cell_m)))
+            for i in range(first[0], last[0] + 1):
+                for j in range(first[1], last[1] + 1):
+                    for k in range(first[2], last[2] + 1):
+                        x, y, z = low[0] + (i + 0.5) * cell_m, low[1] + (j + 0.5) * cell_m, low[2] + (k + 0.5) * cell_m
+                        if nearest(shape, x, y, z)[0] > far:
+                            continue
+                        cell = (i * size[1] + j) * size[2] + k
+                        if filling:
+                            items[taken[cell]] = number
+                            taken[cell] += 1
+                        else:
+                            starts[cell + 1] += 1
+    return starts, items
+
+
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def find_pairs(x: Array, radius_m: float, pairs: Ints, cells: Ints, starts: Ints, order: Ints) -> int:
+    """Fill `pairs` (M, 2) with all particles near each other, by a hashed grid (Teschner et al. 2003); their number.
+
+    cells: (N, 4) room for cell and bucket; starts: (B + 1,), B a power of two; order: (N,).
+    """
+    reach = PAIR_REACH_RADII * radius_m
+    mask = len(starts) - 2
+    starts[:] = 0
+    for i in range(len(x)):
+        for axis in range(3):
+            cells[i, axis] = int(math.floor(x[i, axis] / reach))
+        cells[i, 3] = _bucket(cells[i, 0], cells[i, 1], cells[i, 2], mask)
+        starts[cells[i, 3] + 1] += 1
+    for bucket in range(len(starts) - 1):
+        starts[bucket + 1] += starts[bucket]
+    for i in range(len(x) - 1, -1, -1):
+        # Counting down turns the ends into starts again, one bucket on.
+        starts[cells[i, 3] + 1] -= 1
+        order[starts[cells[i, 3] + 1]] = i
+    found = 0
+    for i in range(len(x)):
+        # This cell and half of its neighbours: the other half looks here.
+        for dx in range(2):
+            for dy in range(-dx, 2):
+                for dz in range(-1 if dx or dy > 0 else 0, 2):
+                    a, b, c = cells[i, 0] + dx, cells[i, 1] + dy, cells[i, 2] + dz
+                    bucket = _bucket(a, b, c, mask)
+                    end = starts[bucket + 2] if bucket + 2 < len(starts) else len(x)
+                    here = dx == 0 and dy == 0 and dz == 0
+                    for place in range(starts[bucket + 1], end):
+                        j = order[place]
+                        if cells[j, 0] != a or cells[j, 1] != b or cells[j, 2] != c or (here and j <= i):
+                            continue
+                        u, v, w = x[i, 0] - x[j, 0], x[i, 1] - x[j, 1], x[i, 2] - x[j, 2]
+                        if u * u + v * v + w * w < reach * reach and found < len(pairs):
+                            pairs[found, 0], pairs[found, 1] = i, j
+                            found += 1
+    return found
+
+
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _bucket(a: int, b: int, c: int, mask: int) -> int:
+    return ((a * 73856093) ^ (b * 19349663) ^ (c * 83492791)) & mask
+
+
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def find_contacts(
+    x: Array,
+    v: Array,
+    radius_m: float,
+    timestep_s: float,
+    shapes: Array,
+    groups: Ints,
+    lows: Array,
+    starts: Ints,
+    items: Ints,
+    poses: Array,
+    which: Ints,
+    contacts: Array,
+) -> int:
+    """Planes that hold the particles back from the walls in this step; their number.
+
+    Each particle's way is followed in the frame of each group, where the walls stand still, up to the first touch with
+    each shape (conservative advancement): the tangent plane there is the contact, so nothing is jumped over. Rows of
+    `contacts`: the plane's normal and offset before the step and their change, and the way of its foot, in the world.
+    """
+    found = 0
+    room = len(which)
+    slack, arrived = SLACK_RADII * radius_m, ARRIVED_RADII * radius_m
+    fall = 0.5 * GRAVITY_M_S2 * timestep_s * timestep_s
+    for i in range(len(x)):
+        for g in range(len(groups)):
+            before, after = poses[g, 0], poses[g, 1]
+            ax, ay, az = _inside(before, x[i, 0], x[i, 1], x[i, 2])
+            bx, by, bz = _inside(
+                after,
+                x[i, 0] + timestep_s * v[i, 0],
+                x[i, 1] + timestep_s * v[i, 1],
+                x[i, 2] + timestep_s * v[i, 2] - fall,
+            )
+            bx, by, bz = bx - ax, by - ay, bz - az
+            way = math.sqrt(bx * bx + by * by + bz * bz)
+            first, last, cell_m, reach_m = groups[g, 0], groups[g, 1], lows[g, 3], lows[g, 4]
+            # Looked up in the middle of the way, from where half of it reaches everything.
+            listed = 0.5 * way < reach_m - slack
+            if listed:
+                cx = int(math.floor((ax + 0.5 * bx - lows[g, 0]) / cell_m))
+                cy = int(math.floor((ay + 0.5 * by - lows[g, 1]) / cell_m))
+                cz = int(math.floor((az + 0.5 * bz - lows[g, 2]) / cell_m))
+                if not (0 <= cx < groups[g, 3] and 0 <= cy < groups[g, 4] and 0 <= cz < groups[g, 5]):
+                    continue
+                cell = groups[g, 2] + (cx * groups[g, 4] + cy) * groups[g, 5] + cz
+                first, last = starts[cell], starts[cell + 1]
+            for place in range(first, last):
+                shape = shapes[items[place]] if listed else shapes[place]
+                if not within(shape, ax, ay, az, radius_m + way + slack):
+                    continue
+                distance, nx, ny, nz = nearest(shape, ax, ay, az)
+                gap = distance - radius_m
+                t = 0.0
+                for _ in range(MAX_STRIDES):
+                    if gap <= arrived or t >= 1.0:
+                        break
+                    t = min(1.0, t + gap / way)
+                    distance, nx, ny, nz = nearest(shape, ax + t * bx, ay + t * by, az + t * bz)
+                    gap = distance - radius_m
+                if gap > slack or found == room:
+                    continue
+                px, py, pz = (
+                    ax + t * bx - distance * nx,
+                    ay + t * by - distance * ny,
+                    az + t * bz - distance * nz,
+                )
+                ux, uy, uz = _turned(before, nx, ny, nz)
+                wx, wy, wz = _turned(after, nx, ny, nz)
+                fx, fy, fz = _outside(before, px, py, pz)
+                hx, hy, hz = _outside(after, px, py, pz)
+                offset = ux * fx + uy * fy + uz * fz + radius_m
+                which[found, 0], which[found, 1] = i, g
+                row = contacts[found]
+                row[0], row[1], row[2], row[3] = ux, uy, uz, offset
+                row[4], row[5], row[6] = wx - ux, wy - uy, wz - uz
+                row[7] = wx * hx + wy * hy + wz * hz + radius_m - offset
+                row[8], row[9], row[10] = hx - fx, hy - fy, hz - fz
+                found += 1
+    return found
+
+
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _inside(T: Array, x: float, y: float, z: float) -> tuple[float, float, float]:
+    x, y, z = x - T[0, 3], y - T[1, 3], z - T[2, 3]
+    return (
+        T[0, 0] * x + T[1, 0] * y + T[2, 0] * z,
+        T[0, 1] * x + T[1, 1] * y + T[2, 1] * z,
+        T[0, 2] * x + T[1, 2] * y + T[2, 2] * z,
+    )
+
+
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _turned(T: Array, x: float, y: float, z: float) -> tuple[float, float, float]:
+    return (
+        T[0, 0] * x + T[0, 1] * y + T[0, 2] * z,
+        T[1, 0] * x + T[1, 1] * y + T[1, 2] * z,
+        T[2, 0] * x + T[2, 1] * y + T[2, 2] * z,
+    )
+
+
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _outside(T: Array, x: float, y: float, z: float) -> tuple[float, float, float]:
+    x, y, z = _turned(T, x, y, z)
+    return x + T[0, 3], y + T[1, 3], z + T[2, 3]
+
+
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def project_pairs(x: Array, last: Array, pairs: Ints, count: int, radius_m: float, friction: float, h: float) -> None:
+    """Push overlapping particles apart, half each (PBD, Müller et al. 2007, eq. 10)."""
+    touch = 2.0 * radius_m
+    for p in range(count):
+        i, j = pairs[p, 0], pairs[p, 1]
+        dx, dy, dz = x[i, 0] - x[j, 0], x[i, 1] - x[j, 1], x[i, 2] - x[j, 2]
+        square = dx * dx + dy * dy + dz * dz
+        if square >= touch * touch:
+            continue
+        distance = math.sqrt(square)
+        if distance < 1e-9:
+            dx, dy, dz, distance = 0.0, 0.0, 1e-9, 1e-9
+        ox, oy, oz = last[i, 0] - last[j, 0], last[i, 1] - last[j, 1], last[i, 2] - last[j, 2]
+        old = touch - math.sqrt(ox * ox + oy * oy + oz * oz)
+        depth = touch - distance - max(0.0, old - PAIR_RECOVERY_M_S * h)
+        if depth <= 0.0:
+            continue
+        nx, ny, nz = dx / distance, dy / distance, dz / distance
+        mx, my, mz = 0.5 * depth * nx, 0.5 * depth * ny, 0.5 * depth * nz
+        if friction > 0.0:
+            fx, fy, fz = _friction(dx - ox, dy - oy, dz - oz, nx, ny, nz, friction * depth)
+            mx, my, mz = mx + 0.5 * fx, my + 0.5 * fy, mz + 0.5 * fz
+        x[i, 0] += mx
+        x[i, 1] += my
+        x[i, 2] += mz
+        x[j, 0] -= mx
+        x[j, 1] -= my
+        x[j, 2] -= mz
+
+
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _friction(
+    dx: float, dy: float, dz: float, nx: float, ny: float, nz: float, most: float
+) -> tuple[float, float, float]:
+    """What takes back the part of a relative way (dx, dy, dz) across the normal, at most `most` long (Coulomb)."""
+    normal = dx * nx + dy * ny + dz * nz
+    dx, dy, dz = dx - normal * nx, dy - normal * ny, dz - normal * nz
+    length = math.sqrt(dx * dx + dy * dy + dz * dz)
+    part = 1.0 if length <= most else most / length
+    return -part * dx, -part * dy, -part * dz
+
+
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def project_contacts(
+    x: Array,
+    last: Array,
+    which: Ints,
+    contacts: Array,
+    count: int,
+    share: float,
+    step: float,
+    friction: float,
+    h: float,
+    radius_m: float,
+    origin: Array,
+    moved: Array,
+) -> None:
+    """Push particles out of walls as they stand when `share` of the step has passed, `step` more than last time.
+
+    Adds what group 0 gave them to `moved` (6,): the sum of their ways and of its moment about `origin`.
+    """
+    for k in range(count):
+        i, c = which[k, 0], contacts[k]
+        nx, ny, nz = c[0] + share * c[4], c[1] + share * c[5], c[2] + share * c[6]
+        depth = c[3] + share * c[7] - (nx * x[i, 0] + ny * x[i, 1] + nz * x[i, 2])
+        if depth <= 0.0:
+            continue
+        ago = share - step
+        old = c[3] + ago * c[7]
+        old -= (c[0] + ago * c[4]) * last[i, 0] + (c[1] + ago * c[5]) * last[i, 1] + (c[2] + ago * c[6]) * last[i, 2]
+        depth -= max(0.0, old - WALL_RECOVERY_M_S * h)
+        if depth <= 0.0:
+            continue
+        mx, my, mz = depth * nx, depth * ny, depth * nz
+        if friction > 0.0:
+            fx, fy, fz = _friction(
+                x[i, 0] - last[i, 0] - step * c[8],
+                x[i, 1] - last[i, 1] - step * c[9],
+                x[i, 2] - last[i, 2] - step * c[10],
+                nx,
+                ny,
+                nz,
+                friction * depth,
+            )
+            mx, my, mz = mx + fx, my + fy, mz + fz
+        x[i, 0] += mx
+        x[i, 1] += my
+        x[i, 2] += mz
+        if which[k, 1] == 0:
+            ax, ay, az = x[i, 0] - radius_m * nx, x[i, 1] - radius_m * ny, x[i, 2] - radius_m * nz
+            ax, ay, az = ax - origin[0], ay - origin[1], az - origin[2]
+            moved[0] += mx
+            moved[1] += my
+            moved[2] += mz
+            moved[3] += ay * mz - az * my
+            moved[4] += az * mx - ax * mz
+            moved[5] += ax * my - ay * mx
+
+
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def advance(
+    x: Array,
+    v: Array,
+    last: Array,
+    poses: Array,
+    shapes: Array,
+    groups: Ints,
+    lows: Array,
+    starts: Ints,
+    items: Ints,
+    pairs: Ints,
+    grid: tuple[Any, Any, Any],
+    which: Ints,
+    contacts: Array,
+    moved: Array,
+    numbers: tuple[float, float, float, float, int],
+) -> None:
+    """One step in small substeps, each with one sweep over all constraints (Macklin et al. 2019)."""
+    radius_m, timestep_s, friction, drag_1_s, substeps = numbers
+    pair_count = find_pairs(x, radius_m, pairs, grid[0], grid[1], grid[2])
+    contact_count = find_contacts(
+        x, v, radius_m, timestep_s, shapes, groups, lows, starts, items, poses, which, contacts
+    )
+    h = timestep_s / substeps
+    kept = 1.0 / (1.0 + drag_1_s * h)
+    moved[:] = 0.0
+    origin = poses[0, 1, :3, 3]
+    for s in range(substeps):
+        for i in range(len(x)):
+            v[i, 2] -= GRAVITY_M_S2 * h
+            for axis in range(3):
+                v[i, axis] *= kept
+                last[i, axis] = x[i, axis]
+                x[i, axis] += h * v[i, axis]
+        project_pairs(x, last, pairs, pair_count, radius_m, friction, h)
+        project_contacts(
+            x,
+            last,
+            which,
+            contacts,
+            contact_count,
+            (s + 1) / substeps,
+            1 / substeps,
+            friction,
+            h,
+            radius_m,
+            origin,
+            moved,
+        )
+        for i in range(len(x)):
+            for axis in range(3):
+                v[i, axis] = (x[i, axis] - last[i, axis]) / h
