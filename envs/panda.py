@@ -1,8 +1,8 @@
 """The Franka Panda as an `MjSpec`: kinematics, inertia and limits from example-robot-data, light visuals, actuators.
 
 World frame = `panda_link0`, z up. The spec holds seven arm joints `panda_joint1..7`, two finger joints
-`panda_finger_joint1..2`, one position actuator per joint (same names) and the site `tcp` at `panda_hand_tcp`,
-midway between the finger pads: z along the approach direction, y along which the fingers close.
+`panda_finger_joint1..2`, one actuator per joint (same names) and the site `tcp` at `panda_hand_tcp`, midway between
+the finger pads: z along the approach direction, y along which the fingers close. Links collide as capsules and boxes.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import importlib.util
 import os
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import mujoco
 import numpy as np
@@ -34,6 +34,8 @@ DQ_MAX_RAD_S: Array = np.array([2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 2.61])
 TAU_MAX_NM: Array = np.array([87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0])
 Q_HOME_RAD: Array = np.array([0.0, -0.785398, 0.0, -2.35619, 0.0, 1.5707, 0.785398])
 FINGER_MAX_M = 0.04
+# What the Franka Hand can press with for as long as one likes.
+FINGER_MAX_N = 70.0
 
 # Stiffness and damping of the joint servos. Natural frequencies lie near 9 Hz at the shoulder and 14 Hz at the wrist
 # with damping ratio about 1: fast enough to follow 25 Hz targets, slow enough that a step between two targets
@@ -45,7 +47,32 @@ STIFFNESS_NM_RAD: Array = np.array([6000.0, 6000.0, 4500.0, 4500.0, 1200.0, 900.
 DAMPING_NM_S_RAD: Array = SERVO_LEAD_S * STIFFNESS_NM_RAD
 
 # Contact bits of the whole scene, in one place: see `scene.py` for the pairs they allow.
-CONTACT_PARTICLE, CONTACT_VESSEL, CONTACT_ROBOT = 1, 2, 4
+CONTACT_PARTICLE, CONTACT_VESSEL, CONTACT_ROBOT, CONTACT_HELD, CONTACT_GRIP = 1, 2, 4, 8, 16
+
+# One capsule a link: both ends of its middle line in the link's frame and its radius, in m. They were fitted to the
+# hulls of the collision meshes, stay within 2 cm of them both ways, and cost a third of what the hulls do.
+CAPSULES_M: dict[str, tuple[tuple[float, float, float], tuple[float, float, float], float]] = {
+    "panda_link0": ((-0.067, 0.0, 0.05), (0.004, 0.0, 0.05), 0.085),
+    "panda_link1": ((0.0, -0.055, 0.0), (0.0, 0.0, -0.138), 0.0665),
+    "panda_link2": ((0.0, -0.141, 0.0), (0.0, 0.0, 0.0545), 0.0665),
+    "panda_link3": ((0.0815, 0.043, -0.001), (0.0, 0.001, -0.0745), 0.066),
+    "panda_link4": ((-0.0815, 0.076, 0.001), (-0.001, 0.002, 0.0435), 0.065),
+    "panda_link5": ((0.001, 0.068, -0.007), (0.001, 0.0035, -0.211), 0.063),
+    "panda_link6": ((0.019, 0.005, 0.0145), (0.088, 0.01, 0.0), 0.06),
+    "panda_link7": ((-0.0065, -0.0065, 0.078), (0.0315, 0.031, 0.079), 0.0415),
+}
+# Boxes (centre, half extents) in m: the palm, and of each finger the pad that grips and the knuckle that carries it.
+PALM_M = ((0.0, 0.0, 0.021), (0.03, 0.102, 0.045))
+PAD_M = ((0.0, 0.0072, 0.0448), (0.0088, 0.0072, 0.0088))
+KNUCKLE_M = ((0.0, 0.0175, 0.018), (0.0105, 0.0085, 0.018))
+# Fixed to each other or so near that their hulls overlap in every configuration.
+NEIGHBOURS = (
+    ("panda_link0", "panda_link1"),
+    ("panda_link5", "panda_link7"),
+    ("panda_link5", "panda_hand"),
+    ("panda_link6", "panda_hand"),
+    ("panda_leftfinger", "panda_rightfinger"),
+)
 
 _COLORS = {"white": (0.93, 0.94, 0.95, 1.0), "dark": (0.24, 0.25, 0.27, 1.0), "blue": (0.04, 0.54, 0.78, 1.0)}
 _FACES_PER_LINK = 2000
@@ -57,10 +84,12 @@ def joint_command(target_rad: Array, target_rad_s: Array) -> Array:
     return target_rad + SERVO_LEAD_S * target_rad_s
 
 
-def panda_spec(visuals: bool = True) -> mujoco.MjSpec:
+def panda_spec(visuals: bool = True, actuation: Literal["servo", "torque"] = "servo") -> mujoco.MjSpec:
     """A fresh `MjSpec` of the Panda with its base at the world's origin.
 
     visuals: False leaves the decimated visual meshes out (kinematics only: faster to compile).
+    actuation: of the arm. "servo" takes joint positions in rad, "torque" joint torques in Nm beyond what gravity needs,
+        as libfranka does. The fingers are position servos in m either way.
     Joint torques, gravity compensation included, are limited to the URDF's efforts.
     """
     root = _description_folder()
@@ -69,37 +98,61 @@ def panda_spec(visuals: bool = True) -> mujoco.MjSpec:
     # Without this, hand and tcp would melt into link 7 and their names would be gone.
     spec.compiler.fusestatic = False
     spec.compiler.discardvisual = False
-    for mesh in spec.meshes:
-        mesh.file = str(root / "meshes" / "collision" / Path(mesh.file).name)
+    for geom in [geom for body in spec.bodies for geom in body.geoms]:
+        spec.delete(geom)
+    for mesh in list(spec.meshes):
+        spec.delete(mesh)
     for body in spec.bodies:
         if body.name == "world":
             continue
         # The compensation goes through the motors, so that it counts against their limits as it does on the robot.
         body.gravcomp = 1.0
-        for geom in body.geoms:
-            geom.group, geom.contype, geom.conaffinity = 3, CONTACT_ROBOT, 0
-            geom.mass, geom.condim = 0.0, 3
         for joint in body.joints:
             joint.actgravcomp = True
-    for name, stiffness, damping in zip(ARM_JOINTS, STIFFNESS_NM_RAD, DAMPING_NM_S_RAD, strict=True):
+    _add_collision_shapes(spec)
+    for name, stiffness, damping, limit in zip(ARM_JOINTS, STIFFNESS_NM_RAD, DAMPING_NM_S_RAD, TAU_MAX_NM, strict=True):
         joint = spec.joint(name)
         joint.armature, joint.damping = ARMATURE_KG_M2, np.array([0.5, 0.0, 0.0])
-        _add_servo(spec, name, float(stiffness), float(damping))
+        if actuation == "servo":
+            _add_servo(spec, name, float(stiffness), float(damping))
+        else:
+            motor = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+            motor.ctrllimited, motor.ctrlrange = mujoco.mjtLimited.mjLIMITED_TRUE, (-float(limit), float(limit))
     for name in FINGER_JOINTS:
         joint = spec.joint(name)
         joint.armature, joint.damping = 0.1, np.array([1.0, 0.0, 0.0])
-        _add_servo(spec, name, 1000.0, 20.0)
+        servo = _add_servo(spec, name, 1000.0, 20.0)
+        servo.forcelimited, servo.forcerange = mujoco.mjtLimited.mjLIMITED_TRUE, (-FINGER_MAX_N, FINGER_MAX_N)
     spec.body("panda_hand_tcp").add_site(name=TCP_SITE, size=[0.005, 0.005, 0.005], group=4)
     if visuals:
         _add_visuals(spec)
     return spec
 
 
-def _add_servo(spec: mujoco.MjSpec, joint: str, stiffness: float, damping: float) -> None:
+def _add_collision_shapes(spec: mujoco.MjSpec) -> None:
+    """Capsules and boxes, named after their link; a finger's pad is `LINK_pad`."""
+    for link, (start, end, radius) in CAPSULES_M.items():
+        _solid(spec.body(link), type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=[*start, *end], size=[radius, 0.0, 0.0])
+    _solid(spec.body("panda_hand"), pos=PALM_M[0], size=PALM_M[1])
+    for side, finger in ((1.0, "panda_leftfinger"), (-1.0, "panda_rightfinger")):
+        for name, ((x, y, z), half) in (("pad", PAD_M), ("knuckle", KNUCKLE_M)):
+            _solid(spec.body(finger), name=f"{finger}_{name}", pos=[x, side * y, z], size=half)
+    for first, second in NEIGHBOURS:
+        spec.add_exclude(bodyname1=first, bodyname2=second)
+
+
+def _solid(body: mujoco.MjsBody, **shape: Any) -> None:
+    geom = body.add_geom(**{"type": mujoco.mjtGeom.mjGEOM_BOX, "name": f"{body.name}_shape", **shape})
+    geom.group, geom.contype, geom.conaffinity = 3, CONTACT_ROBOT, CONTACT_ROBOT
+    geom.mass, geom.condim = 0.0, 3
+
+
+def _add_servo(spec: mujoco.MjSpec, joint: str, stiffness: float, damping: float) -> mujoco.MjsActuator:
     actuator = spec.add_actuator(name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
     actuator.gaintype, actuator.biastype = mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_AFFINE
     actuator.gainprm[0] = stiffness
     actuator.biasprm[:3] = (0.0, -stiffness, -damping)
+    return actuator
 
 
 def _description_folder() -> Path:
