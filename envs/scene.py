@@ -1,14 +1,14 @@
 """The whole scene as one `MjSpec`: robot, table, held vessel, receptacle, particles, cameras, lights.
 
-Contact pairs: particles touch particles, vessels and furniture; the arm touches furniture. Nothing else collides: the
-vessels do not touch each other or the table, the arm touches neither particles nor itself.
+Contact pairs: particles touch particles, vessels and furniture; the arm touches itself and furniture; the held vessel
+touches furniture with its hull. Nothing else collides: vessels do not touch each other, the arm touches no particles.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import mujoco
 import numpy as np
@@ -18,7 +18,7 @@ from ..extract.errors import UserError
 from ..extract.geometry import Array, invert_pose, make_pose, transform_points
 from .cameras import add_cameras
 from .liquid import Liquid, add_particles
-from .panda import CONTACT_PARTICLE, CONTACT_ROBOT, CONTACT_VESSEL, panda_spec
+from .panda import CONTACT_HELD, CONTACT_PARTICLE, CONTACT_ROBOT, CONTACT_VESSEL, panda_spec
 from .vessel_geometry import STANDING_WALL_M, Box, Cavity, cavity_of, collision_boxes, visual_parts
 
 if TYPE_CHECKING:
@@ -30,6 +30,8 @@ TABLE_CENTER_XY_M, TABLE_HALF_M, TABLE_THICKNESS_M = (0.35, 0.0), (0.75, 0.75), 
 FLOOR_Z_M = -0.72
 MAX_PICTURE_PX = 1920
 WATER_RGBA = [0.42, 0.78, 0.98, 1.0]
+# The hull of the held vessel ends this much inside its surface: one that stands on the table is not pushed.
+HULL_INSET_M, HULL_VERTICES = 0.002, 40
 # The receptacle gets a pedestal when it stands higher than this above the table.
 PEDESTAL_FROM_M = 0.004
 
@@ -54,7 +56,14 @@ class Scene:
     liquid: Liquid
 
 
-def build_scene(reference: Reference, num_particles: int, liquid: Liquid, timestep_s: float) -> Scene:
+def build_scene(
+    reference: Reference,
+    num_particles: int,
+    liquid: Liquid,
+    timestep_s: float,
+    *,
+    actuation: Literal["servo", "torque"] = "servo",
+) -> Scene:
     """Build and compile the scene of a reference.
 
     Raises UserError when the receptacle would stand in the table.
@@ -65,7 +74,7 @@ def build_scene(reference: Reference, num_particles: int, liquid: Liquid, timest
     radius_m = liquid.radius_for(num_particles, vessel_cavity.volume_m3, receptacle_cavity.volume_m3, throat_m)
     T_world_receptacle = reference.T_world_receptacle
 
-    spec = panda_spec()
+    spec = panda_spec(actuation=actuation)
     spec.modelname = "vid2demo_pouring"
     _set_options(spec, timestep_s)
     # As stiff as the step allows. The impedance is a little below MuJoCo's default: with it eight solver iterations
@@ -83,6 +92,7 @@ def build_scene(reference: Reference, num_particles: int, liquid: Liquid, timest
     # it costs the contact solver nothing. What a hand of rubber and steel would give way is left out.
     held = spec.body("panda_hand_tcp").add_body(name=VESSEL_BODY, **_placed(reference.T_hand_object))
     _add_vessel(spec, held, vessel, vessel_boxes, vessel_contact)
+    _add_hull(spec, held, vessel, contact)
     held.gravcomp = 1.0
     standing = spec.worldbody.add_body(name=RECEPTACLE_BODY, **_placed(T_world_receptacle))
     standing_boxes = collision_boxes(receptacle, receptacle_cavity, STANDING_WALL_M)
@@ -180,7 +190,7 @@ def _add_furniture(spec: mujoco.MjSpec, contact: dict[str, Any]) -> None:
         rgb1=[0.78, 0.80, 0.82],
         rgb2=[0.72, 0.74, 0.77],
     )
-    solid = {**contact, "contype": 0, "conaffinity": CONTACT_PARTICLE | CONTACT_ROBOT}
+    solid = {**contact, "contype": 0, "conaffinity": CONTACT_PARTICLE | CONTACT_ROBOT | CONTACT_HELD}
     half = [*TABLE_HALF_M, TABLE_THICKNESS_M / 2]
     x, y = TABLE_CENTER_XY_M
     spec.worldbody.add_geom(
@@ -233,6 +243,18 @@ def _add_vessel(
     # A box of the vessel's size, its mass spread toward the walls, is near enough for what a wrist feels.
     x, y, z = vessel.extents_m
     body.inertia = [vessel.mass_kg / 8 * (a * a + b * b) for a, b in ((y, z), (x, z), (x, y))]
+
+
+def _add_hull(spec: mujoco.MjSpec, body: mujoco.MjsBody, vessel: Vessel, contact: dict[str, Any]) -> None:
+    """What the held vessel touches the table with: the walls for particles reach too far out for that."""
+    hull = vessel.mesh.convex_hull
+    # The vessel's frame has its origin in the middle of the bounding box.
+    shrunk = np.asarray(hull.vertices) * (1.0 - 2.0 * HULL_INSET_M / np.asarray(vessel.extents_m))
+    mesh = spec.add_mesh(name=f"{body.name}_hull", uservert=shrunk.ravel(), userface=np.asarray(hull.faces).ravel())
+    mesh.maxhullvert = HULL_VERTICES
+    geom = body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, name=mesh.name, meshname=mesh.name)
+    geom.contype, geom.conaffinity, geom.condim = CONTACT_HELD, 0, contact["condim"]
+    geom.solref[:2], geom.solimp, geom.group, geom.mass = contact["solref"], contact["solimp"], 3, 0.0
 
 
 def _add_pedestal(
