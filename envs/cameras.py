@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ..extract.errors import UserError
 from ..extract.geometry import Array, look_at, transform_points
 
 if TYPE_CHECKING:
@@ -16,10 +20,82 @@ if TYPE_CHECKING:
     from .reference import Reference
 
 CAMERAS = ("front", "wrist", "side")
+MIN_FOVY_DEG, MAX_FOVY_DEG = 1.0, 170.0
 
 
-def add_cameras(spec: mujoco.MjSpec, reference: Reference, vessel: Vessel, T_world_receptacle: Array) -> None:
-    """Cameras from which the whole motion and the receptacle can be seen."""
+@dataclass(frozen=True, eq=False)
+class CameraPose:
+    """A camera of one's own that stands still in the world.
+
+    name: letters, digits and underscores. T_world_camera: (4, 4) pose in m, with OpenCV's axes: x right, y down, z
+    forward. fovy_deg: vertical field of view.
+    Raises UserError for what is no such pose.
+    """
+
+    name: str
+    T_world_camera: Array
+    fovy_deg: float = 45.0
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.name, str) or not re.fullmatch(r"\w+", self.name, re.ASCII):
+            raise UserError(f"a camera is called {self.name!r}; use letters, digits and underscores")
+        if self.name in CAMERAS:
+            raise UserError(f"a camera of your own is called {self.name!r} like a built-in one; choose another name")
+        try:
+            T = np.array(self.T_world_camera, np.float64)
+        except (TypeError, ValueError) as error:
+            raise UserError(f"T_world_camera of camera {self.name} is no array of numbers ({error})") from error
+        rigid = T.shape == (4, 4) and np.all(np.isfinite(T)) and np.allclose(T[3], (0.0, 0.0, 0.0, 1.0))
+        if not rigid or not np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-4) or np.linalg.det(T[:3, :3]) < 0:
+            raise UserError(
+                f"T_world_camera of camera {self.name} is no pose; give a (4, 4) rigid transform, with the rotation's "
+                "columns x right, y down, z forward"
+            )
+        if not isinstance(self.fovy_deg, int | float) or not MIN_FOVY_DEG <= self.fovy_deg <= MAX_FOVY_DEG:
+            raise UserError(
+                f"fovy_deg of camera {self.name} is {self.fovy_deg!r}; give {MIN_FOVY_DEG:g} to {MAX_FOVY_DEG:g} degrees"
+            )
+        object.__setattr__(self, "T_world_camera", T)
+
+
+def chosen_cameras(
+    cameras: Sequence[str | CameraPose | Mapping[str, Any]],
+) -> tuple[tuple[str, ...], tuple[CameraPose, ...]]:
+    """Names of the cameras that were asked for, in order, and those among them that are one's own.
+
+    Each is a built-in name, a `CameraPose`, or a mapping of its fields (so that it can stand in a JSON file).
+    Raises UserError for anything else, for no camera at all and for two of one name.
+    """
+    if isinstance(cameras, str) or len(cameras) == 0:
+        raise UserError(f"cameras is {cameras!r}; give a tuple of names out of {', '.join(CAMERAS)}, or of CameraPose")
+    names, own = [], []
+    for camera in cameras:
+        if isinstance(camera, Mapping):
+            if set(camera) - {"name", "T_world_camera", "fovy_deg"} or not {"name", "T_world_camera"} <= set(camera):
+                raise UserError(f"a camera has the fields {sorted(camera)}; give name, T_world_camera and fovy_deg")
+            camera = CameraPose(**camera)
+        if isinstance(camera, CameraPose):
+            own.append(camera)
+            names.append(camera.name)
+        elif camera in CAMERAS:
+            names.append(str(camera))
+        else:
+            raise UserError(f"camera is {camera!r}; choose {', '.join(CAMERAS)}, or give a CameraPose")
+    if len(set(names)) != len(names):
+        raise UserError(f"cameras names {', '.join(names)}; give each of them once")
+    return tuple(names), tuple(own)
+
+
+def add_cameras(
+    spec: mujoco.MjSpec,
+    reference: Reference,
+    vessel: Vessel,
+    T_world_receptacle: Array,
+    own: Sequence[CameraPose] = (),
+) -> None:
+    """Cameras from which the whole motion and the receptacle can be seen, and one's own."""
+    for camera in own:
+        _add_camera(spec.worldbody, camera.name, camera.T_world_camera, camera.fovy_deg)
     path = reference.T_world_object[:, :3, 3]
     points = np.vstack([path, T_world_receptacle[:3, 3]])
     low, high = points.min(0), points.max(0)

@@ -1,0 +1,386 @@
+"""Cameras, overlays and the viewer's window."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import mujoco
+import mujoco.viewer
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from vid2demo.envs.cameras import CAMERAS, CameraPose, add_cameras, chosen_cameras
+from vid2demo.envs.overlays import OVERLAYS, Hud, Overlay, Overlays, overlay_names, write_hud
+from vid2demo.envs.pouring import PandaPourEnv
+from vid2demo.envs.reference import Reference
+from vid2demo.envs.rendering import Cameras, Viewer, has_screen
+from vid2demo.envs.scene import FLOOR_Z_M
+from vid2demo.extract.errors import UserError
+from vid2demo.extract.geometry import Array, look_at, project
+
+SIZE = (120, 160)
+HUD = Hud(1.5, 0.5, 0.25, 0.012, 0.1)
+
+
+@pytest.fixture(scope="module")
+def full(mug_pour: Reference) -> Iterator[PandaPourEnv]:
+    env = PandaPourEnv(mug_pour, num_particles=20)
+    env.reset(seed=0)
+    yield env
+    env.close()
+
+
+@pytest.fixture(scope="module")
+def empty(mug_pour: Reference) -> Iterator[PandaPourEnv]:
+    env = PandaPourEnv(mug_pour, num_particles=0)
+    env.reset(seed=0)
+    yield env
+    env.close()
+
+
+@pytest.fixture
+def drawn(empty: PandaPourEnv) -> Iterator[Cameras]:
+    made = Cameras(empty.model)
+    yield made
+    made.close()
+
+
+def intrinsics(model: mujoco.MjModel, camera: str, size: tuple[int, int]) -> tuple[Array, Array]:
+    """T_camera_world (4, 4) and camera matrix (3, 3) of a camera of a model, with OpenCV's axes."""
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    number = model.camera(camera).id
+    T = np.eye(4)
+    T[:3, :3] = data.cam_xmat[number].reshape(3, 3) @ np.diag([1.0, -1.0, -1.0])
+    T[:3, 3] = data.cam_xpos[number]
+    focal = size[0] / 2 / math.tan(math.radians(model.cam_fovy[number]) / 2)
+    # The middle of the picture lies between pixels, pixel 0's centre at 0.
+    K = np.array([[focal, 0, size[1] / 2 - 0.5], [0, focal, size[0] / 2 - 0.5], [0, 0, 1]])
+    return np.linalg.inv(T), K
+
+
+def changed(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> Array:
+    """(K, 2) pixels (x, y) in which two pictures differ by more than rounding."""
+    rows, columns = np.nonzero(np.abs(one.astype(int) - other).max(axis=2) > 3)
+    return np.column_stack([columns, rows]).astype(float)
+
+
+def on_picture(model: mujoco.MjModel, camera: str, point_m: Array) -> Array:
+    T_camera_world, K = intrinsics(model, camera, SIZE)
+    return np.asarray(project(K, (T_camera_world[:3, :3] @ point_m + T_camera_world[:3, 3])[None])[0])
+
+
+# ---------------------------------------------------------------------- pictures
+
+
+def test_pictures_are_of_the_wanted_size_and_repeat_bit_for_bit(empty: PandaPourEnv, drawn: Cameras) -> None:
+    first = {(c, size): drawn.picture(empty.data, c, size) for c in CAMERAS for size in (SIZE, (96, 96), (240, 320))}
+    for (camera, size), picture in first.items():
+        assert picture.shape == (*size, 3)
+        assert picture.dtype == np.uint8
+        assert picture.flags.c_contiguous
+        assert picture.std() > 10
+        assert np.array_equal(drawn.picture(empty.data, camera, size), picture)
+
+
+def test_pictures_stand_upright(empty: PandaPourEnv, drawn: Cameras) -> None:
+    picture = drawn.picture(empty.data, "side", SIZE).astype(int)
+    top, bottom = picture[:8].mean(axis=(0, 1)), picture[-8:].mean(axis=(0, 1))
+    assert top[2] > top[0]  # sky
+    assert bottom[0] > bottom[2] + 20  # wood
+
+
+def test_a_picture_is_not_the_buffer_of_the_next(empty: PandaPourEnv, drawn: Cameras) -> None:
+    front = drawn.picture(empty.data, "front", SIZE)
+    kept = front.copy()
+    drawn.picture(empty.data, "wrist", SIZE)
+    assert np.array_equal(front, kept)
+
+
+def test_scenes_draw_side_by_side_and_outlive_each_other(full: PandaPourEnv, empty: PandaPourEnv) -> None:
+    one, other = Cameras(full.model), Cameras(empty.model)
+    alone = one.picture(full.data, "wrist", SIZE), other.picture(empty.data, "wrist", SIZE)
+    for _ in range(2):
+        assert np.array_equal(one.picture(full.data, "wrist", SIZE), alone[0])
+        assert np.array_equal(other.picture(empty.data, "wrist", SIZE), alone[1])
+    one.close()
+    assert np.array_equal(other.picture(empty.data, "wrist", SIZE), alone[1])
+    assert np.array_equal(one.picture(full.data, "wrist", SIZE), alone[0])
+    one.close()
+    other.close()
+
+
+def test_particles_beside_the_model_look_like_the_model_s(
+    full: PandaPourEnv, empty: PandaPourEnv, drawn: Cameras
+) -> None:
+    engine = full._renderer.picture(full.data, "wrist", (240, 320))
+    particles = full.particle_positions_m, full._scene.radius_m
+    for _ in range(2):
+        beside = drawn.picture(empty.data, "wrist", (240, 320), particles)
+        assert len(changed(engine, beside)) == 0
+    assert len(changed(beside, drawn.picture(empty.data, "wrist", (240, 320)))) > 500
+
+
+def test_more_and_fewer_particles_leave_none_behind(empty: PandaPourEnv, drawn: Cameras) -> None:
+    points = np.array([[0.5, 0.0, 0.3], [0.5, 0.1, 0.3], [0.45, 0.05, 0.35]])
+    two = drawn.picture(empty.data, "front", SIZE, (points[:2], 0.02))
+    three = drawn.picture(empty.data, "front", SIZE, (points, 0.02))
+    assert len(changed(two, three)) > 10
+    assert np.array_equal(drawn.picture(empty.data, "front", SIZE, (points[:2], 0.02)), two)
+    assert len(changed(drawn.picture(empty.data, "front", SIZE, (points[:2], 0.03)), two)) > 10
+    assert len(changed(drawn.picture(empty.data, "front", SIZE, (points[:0], 0.02)), two)) > 10
+
+
+@pytest.mark.parametrize("camera", ["front", "side"])
+def test_built_in_cameras_see_vessel_and_receptacle_all_along(camera: str, empty: PandaPourEnv) -> None:
+    T_camera_world, K = intrinsics(empty.model, camera, SIZE)
+    path = np.vstack([empty.reference.T_world_object[:, :3, 3], empty.T_world_receptacle[:3, 3]])
+    pixels = project(K, path @ T_camera_world[:3, :3].T + T_camera_world[:3, 3])
+    assert np.all(pixels > 0.08 * SIZE[0])
+    assert np.all(pixels < np.array(SIZE[::-1]) - 0.08 * SIZE[0])
+
+
+# ---------------------------------------------------------------------- one's own camera
+
+
+def test_own_camera_sees_a_point_where_its_pose_says(empty: PandaPourEnv) -> None:
+    eye, target = np.array([1.1, -0.4, 0.6]), np.array([0.5, 0.0, 0.15])
+    pose = CameraPose("mine", look_at(eye, target, np.array([0.0, 0.0, 1.0])), 50.0)
+    spec = mujoco.MjSpec()
+    spec.worldbody.add_body(name="panda_hand_tcp")
+    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[3, 3, 0.1], pos=[0, 0, FLOOR_Z_M])
+    spec.visual.headlight.active = True
+    add_cameras(spec, empty.reference, empty.reference.vessel(), empty.T_world_receptacle, (pose,))
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    cameras = Cameras(model)
+    assert {model.camera(i).name for i in range(model.ncam)} == {*CAMERAS, "mine"}
+    assert np.allclose(np.linalg.inv(intrinsics(model, "mine", SIZE)[0]), pose.T_world_camera)
+    blank = cameras.picture(data, "mine", SIZE)
+    for point in (target, target + np.array([0.1, 0.05, 0.08]), target - np.array([0.05, 0.12, 0.02])):
+        seen = changed(blank, cameras.picture(data, "mine", SIZE, (point[None], 0.02)))
+        assert np.linalg.norm(seen.mean(axis=0) - on_picture(model, "mine", point)) < 0.7
+    cameras.close()
+
+
+def test_cameras_may_be_names_poses_and_mappings() -> None:
+    mine = CameraPose("mine", np.eye(4))
+    names, own = chosen_cameras(("wrist", mine, {"name": "top", "T_world_camera": np.eye(4).tolist()}, "front"))
+    assert names == ("wrist", "mine", "top", "front")
+    assert [camera.name for camera in own] == ["mine", "top"]
+    assert chosen_cameras(("side",)) == (("side",), ())
+
+
+@pytest.mark.parametrize(
+    ("cameras", "said"),
+    [
+        ((), "give a tuple"),
+        ("front", "give a tuple"),
+        (("back",), "'back'"),
+        ((3,), "3"),
+        (("front", "front"), "once"),
+        ((CameraPose("a", np.eye(4)), {"name": "a", "T_world_camera": np.eye(4)}), "once"),
+        (({"name": "a"},), "T_world_camera"),
+        (({"name": "a", "T_world_camera": np.eye(4), "zoom": 2},), "zoom"),
+    ],
+)
+def test_cameras_that_make_no_sense_are_refused(cameras: Any, said: str) -> None:
+    with pytest.raises(UserError, match=said):
+        chosen_cameras(cameras)
+
+
+@pytest.mark.parametrize(
+    ("fields", "said"),
+    [
+        ({"name": "front"}, "built-in"),
+        ({"name": "a/b"}, "underscores"),
+        ({"name": ""}, "underscores"),
+        ({"T_world_camera": np.eye(3)}, "rigid"),
+        ({"T_world_camera": np.diag([1.0, 1.0, -1.0, 1.0])}, "rigid"),
+        ({"T_world_camera": 2 * np.eye(4)}, "rigid"),
+        ({"T_world_camera": np.full((4, 4), np.nan)}, "rigid"),
+        ({"T_world_camera": "here"}, "numbers"),
+        ({"fovy_deg": 0.0}, "fovy_deg"),
+        ({"fovy_deg": math.nan}, "fovy_deg"),
+        ({"fovy_deg": "wide"}, "fovy_deg"),
+    ],
+)
+def test_own_cameras_that_make_no_sense_are_refused(fields: dict[str, Any], said: str) -> None:
+    with pytest.raises(UserError, match=said):
+        CameraPose(**{"name": "mine", "T_world_camera": np.eye(4), **fields})
+
+
+# ---------------------------------------------------------------------- overlays
+
+
+def test_overlays_are_drawn_and_leave_no_trace(full: PandaPourEnv) -> None:
+    before = full.get_state()
+    plain = full._renderer.picture(full.data, "front", SIZE)
+    ghost = full.T_world_object
+    ghost[:3, 3] += [0.0, 0.12, 0.08]
+    trail = np.linspace(ghost[:3, 3], full.T_world_object[:3, 3] + [0, 0, 0.1], 10)
+    for overlay in (Overlay(T_world_ghost=ghost), Overlay(trail_m=trail), Overlay(hud=HUD)):
+        assert len(changed(plain, full._renderer.picture(full.data, "front", SIZE, overlay=overlay))) > 30
+    assert np.array_equal(full._renderer.picture(full.data, "front", SIZE), plain)
+    assert np.array_equal(full._renderer.picture(full.data, "front", SIZE, overlay=Overlay()), plain)
+    after = full.get_state()
+    assert np.array_equal(before["physics"], after["physics"])
+
+
+def test_ghost_stands_at_the_reference_s_pose_and_lets_the_scene_through(empty: PandaPourEnv, drawn: Cameras) -> None:
+    plain = drawn.picture(empty.data, "side", SIZE)
+    T = empty.T_world_object
+    T[:3, 3] += [0.0, 0.02, 0.15]
+    # Half a turn about the upright axis brings the handle to the other side.
+    turned = T.copy()
+    turned[:3, :2] *= -1
+    pictures = [drawn.picture(empty.data, "side", SIZE, overlay=Overlay(T_world_ghost=pose)) for pose in (T, turned)]
+    assert len(changed(*pictures)) > 10
+    seen = changed(plain, pictures[0])
+    assert np.linalg.norm(np.median(seen, axis=0) - on_picture(empty.model, "side", T[:3, 3])) < 6
+    x, y = np.median(seen, axis=0).astype(int)
+    assert pictures[0][y, x, 1] > plain[y, x, 1] * 0.6  # translucent, not opaque
+
+
+def test_trail_runs_through_its_points(empty: PandaPourEnv, drawn: Cameras) -> None:
+    points = np.array([[0.45, -0.2, 0.25], [0.5, 0.0, 0.28], [0.5, 0.2, 0.3]])
+    plain = drawn.picture(empty.data, "front", SIZE)
+    seen = changed(plain, drawn.picture(empty.data, "front", SIZE, overlay=Overlay(trail_m=points)))
+    for point in points:
+        assert np.linalg.norm(seen - on_picture(empty.model, "front", point), axis=1).min() < 3
+    one_point = drawn.picture(empty.data, "front", SIZE, overlay=Overlay(trail_m=points[:1]))
+    assert np.array_equal(one_point, plain)
+
+
+@pytest.mark.parametrize("size", [(16, 16), (96, 96), (96, 640), (480, 640), (1080, 1920)])
+def test_hud_fits_every_picture_and_its_bar_tells_the_fractions(size: tuple[int, int]) -> None:
+    def coloured(hud: Hud, rgb: tuple[int, int, int]) -> int:
+        picture = np.full((*size, 3), 127, np.uint8)
+        write_hud(picture, hud)
+        return int(np.count_nonzero(np.all(picture == rgb, axis=2)))
+
+    poured, spilled = (74, 163, 255), (255, 107, 87)
+    half, full_bar = (coloured(Hud(0, part, 0, 0, 0), poured) for part in (0.5, 1.0))
+    assert 0.35 < half / full_bar < 0.65
+    assert coloured(Hud(0, 0, 0, 0, 0), poured) == 0
+    assert coloured(Hud(0, 0.5, 0.5, 0, 0), spilled) == full_bar - half
+
+
+def test_trail_remembers_about_a_second_and_forgets_on_restart() -> None:
+    lip = np.array([0.05, 0.0, 0.04])
+    overlays = Overlays(("trail", "hud"), lip, control_hz=10)
+    overlays.restart()
+    for k in range(30):
+        T = np.eye(4)
+        T[0, 3] = k
+        overlays.record(T)
+    now = overlays.at(np.eye(4), HUD)
+    assert now is not None
+    assert now.trail_m is not None
+    assert np.allclose(now.trail_m[:, 0], np.arange(19, 30) + 0.05)
+    assert now.T_world_ghost is None
+    assert now.hud is HUD
+    overlays.restart()
+    again = overlays.at(np.eye(4), HUD)
+    assert again is not None
+    assert again.trail_m is not None
+    assert len(again.trail_m) == 0
+
+
+def test_no_overlay_is_the_default_choice() -> None:
+    assert Overlays((), np.zeros(3), 25).at(np.eye(4), HUD) is None
+    assert overlay_names(OVERLAYS) == OVERLAYS
+
+
+@pytest.mark.parametrize("names", ["hud", ("shadow",), ("hud", "hud")])
+def test_unknown_overlays_are_refused(names: Any) -> None:
+    with pytest.raises(UserError, match="ghost, trail, hud"):
+        overlay_names(names)
+
+
+# ---------------------------------------------------------------------- the window
+
+
+class Window:
+    """Stands in for the viewer's handle where there is no screen."""
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        self.user_scn = mujoco.MjvScene(model, 1000)
+        self.running, self.synced, self.texts = True, 0, ()
+
+    def lock(self) -> Any:
+        import contextlib
+
+        return contextlib.nullcontext()
+
+    def is_running(self) -> bool:
+        return self.running
+
+    def sync(self) -> None:
+        self.synced += 1
+
+    def set_texts(self, texts: Any) -> None:
+        self.texts = texts
+
+    def close(self) -> None:
+        self.running = False
+
+
+@pytest.fixture
+def window(empty: PandaPourEnv, monkeypatch: pytest.MonkeyPatch) -> Window:
+    import vid2demo.envs.rendering as rendering
+
+    made = Window(empty.model)
+    monkeypatch.setattr(rendering, "_require_screen", lambda: None)
+    monkeypatch.setattr(mujoco.viewer, "launch_passive", lambda *_, **__: made)
+    return made
+
+
+def test_viewer_shows_particles_and_overlays_of_this_moment_only(empty: PandaPourEnv, window: Window) -> None:
+    viewer = Viewer(empty.model, empty.data, fps=1000)
+    particles = np.zeros((7, 3)), 0.005
+    viewer.show(particles, Overlay(np.eye(4), np.zeros((4, 3)), HUD))
+    shapes = window.user_scn.ngeom
+    assert shapes > 7 + 3
+    assert "50 %" in window.texts[3]
+    viewer.show(particles)
+    assert window.user_scn.ngeom == 7
+    viewer.show()
+    assert (window.user_scn.ngeom, window.synced) == (0, 3)
+    assert viewer.is_open
+    viewer.close()
+    viewer.show()
+    assert (viewer.is_open, window.synced) == (False, 3)
+
+
+def test_viewer_keeps_real_time(empty: PandaPourEnv, window: Window) -> None:
+    viewer = Viewer(empty.model, empty.data, fps=50)
+    start = time.monotonic()
+    for _ in range(10):
+        viewer.show()
+    assert 0.19 <= time.monotonic() - start < 0.5
+
+
+def test_viewer_without_a_screen_names_the_mend(empty: PandaPourEnv, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("platform.system", lambda: "Linux")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    assert not has_screen()
+    with pytest.raises(UserError, match="rgb_array"):
+        Viewer(empty.model, empty.data, fps=25)
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_viewer_with_a_screen_that_is_not_there_does_not_hang(
+    empty: PandaPourEnv, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("platform.system", lambda: "Linux")
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setenv("DISPLAY", ":7391")
+    assert has_screen()
+    with pytest.raises(UserError, match=":7391"):
+        Viewer(empty.model, empty.data, fps=25)
