@@ -33,7 +33,7 @@ def step_cost(env: PandaPourEnv, actions: np.ndarray[Any, Any]) -> tuple[float, 
     for action in actions:
         state = env.get_state()
         env.set_state(state)  # before both, so that both start with the same caches
-        commands = env._commands(env._target_from(np.asarray(action, np.float64)))
+        commands, _ = env.before_step(action)
         control = env.data.ctrl
         start = time.process_time()
         for command in commands:
@@ -77,10 +77,10 @@ def main() -> None:
     env.reset(seed=0)
     pictures = {}
     for size in SIZES:
-        env._renderer.picture(env.data, "front", size)
+        env._stage.pictures.picture(env.data, "front", size)
         start = time.process_time()
         for _ in range(20):
-            env._renderer.picture(env.data, "front", size)
+            env._stage.pictures.picture(env.data, "front", size)
         pictures[f"{size[1]}x{size[0]}"] = 20 / (time.process_time() - start)
     env.close()
     if "--json" in sys.argv:

@@ -20,11 +20,13 @@ if TYPE_CHECKING:
 LIFT_S, MOVE_S, TILT_S, HOLD_S = 1.0, 1.4, 2.4, 1.0
 
 
-def builtin_reference(control_hz: float = 25.0) -> Reference:
-    """A mug is lifted off the table and emptied into a bowl with a tilt of 110 degrees."""
+def builtin_reference(
+    control_hz: float = 25.0, vessel: Vessel | None = None, receptacle: Vessel | None = None
+) -> Reference:
+    """A vessel, by default a mug, is lifted off the table and emptied into a bowl or another receptacle."""
     from ..extract.vessels import make_vessel
 
-    return pour_reference(make_vessel("mug"), make_vessel("bowl"), control_hz=control_hz)
+    return pour_reference(vessel or make_vessel("mug"), receptacle or make_vessel("bowl"), control_hz=control_hz)
 
 
 def grasp_pose(grasp: GraspRegion, pitch_rad: float = 0.0, upside: bool = False) -> Array:
@@ -82,7 +84,7 @@ def pour_reference(
     T = np.tile(np.eye(4), (len(time_s), 1, 1))
     T[:, :3, :3], T[:, :3, 3] = R, position
 
-    T_hand_object, q_start_rad = _reachable_grasp(vessel, T)
+    T_hand_object, q_start_rad = reachable_grasp(vessel, T)
     header = {
         "symmetry": vessel.symmetry.to_json(),
         "vessel": vessel_to_header(vessel),
@@ -111,7 +113,7 @@ def _rise_over_rim_m(vessel: Vessel, receptacle: Vessel, R: Array, above_rim_m: 
     return np.asarray(scale * left)
 
 
-def _reachable_grasp(vessel: Vessel, T_world_object: Array) -> tuple[Array, Array]:
+def reachable_grasp(vessel: Vessel, T_world_object: Array) -> tuple[Array, Array]:
     """The grasp (4, 4) and start posture (7,) that carry the vessel along the path with the widest joint margins."""
     grasps = [
         grasp_pose(grasp, pitch_rad, upside)

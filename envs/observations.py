@@ -1,43 +1,81 @@
-"""What the agent sees: names and spaces of the observations, and the errors against the reference."""
+"""What the agent sees: names, units, frames and ranges of the observations, and the errors against the reference."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, replace
 from typing import Any
 
-import mujoco
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ..extract.geometry import Array
-from .panda import ARM_JOINTS
+from .panda import ARM_JOINTS, DQ_MAX_RAD_S, Q_MAX_RAD, Q_MIN_RAD
 from .reference import Reference, interpolate_poses
 
 # The reference's pose so many seconds ahead is part of the observation.
 LOOK_AHEAD_S = (0.04, 0.2, 0.6)
 _XYZ = ("x", "y", "z")
+_NO_LIMIT = math.inf
 
-AGENT_NAMES = (*(f"{name}_rad" for name in ARM_JOINTS), *(f"{name}_rad_s" for name in ARM_JOINTS))
-ENVIRONMENT_NAMES = (
-    *(f"object_position_{axis}_m" for axis in _XYZ),
-    *(f"object_x_axis_{axis}" for axis in _XYZ),
-    *(f"object_z_axis_{axis}" for axis in _XYZ),
-    *(f"object_velocity_{axis}_m_s" for axis in _XYZ),
-    *(f"object_angular_velocity_{axis}_rad_s" for axis in _XYZ),
+
+@dataclass(frozen=True)
+class Entry:
+    """One number of an action or an observation. `low` and `high`: what it keeps to; infinite when nothing binds it."""
+
+    name: str
+    unit: str
+    frame: str
+    low: float
+    high: float
+    description: str
+
+
+def _vector(name: str, unit: str, frame: str, description: str, limit: float = _NO_LIMIT) -> tuple[Entry, ...]:
+    suffix = "_" + unit.replace("/", "_") if unit != "1" else ""
+    return tuple(Entry(f"{name}_{axis}{suffix}", unit, frame, -limit, limit, description) for axis in _XYZ)
+
+
+AGENT_ENTRIES = (
     *(
-        f"reference_{round(1000 * ahead)}ms_{kind}"
-        for ahead in LOOK_AHEAD_S
-        for kind in (*(f"offset_{axis}_m" for axis in _XYZ), *(f"turn_{axis}_rad" for axis in _XYZ))
+        # Soft limits give way a little under load: the range is the robot's, not a promise to the last digit.
+        Entry(f"{name}_rad", "rad", "joint", -_NO_LIMIT, _NO_LIMIT, f"joint position, limits {low:g} to {high:g}")
+        for name, low, high in zip(ARM_JOINTS, Q_MIN_RAD, Q_MAX_RAD, strict=True)
     ),
-    "object_tilt_rad",
-    "held_fraction",
-    "poured_fraction",
-    "spilled_fraction",
-    *(f"receptacle_position_{axis}_m" for axis in _XYZ),
-    "reference_phase",
+    *(
+        Entry(f"{name}_rad_s", "rad/s", "joint", -_NO_LIMIT, _NO_LIMIT, f"joint velocity, limit {most:g}")
+        for name, most in zip(ARM_JOINTS, DQ_MAX_RAD_S, strict=True)
+    ),
 )
+ENVIRONMENT_ENTRIES = (
+    *_vector("object_position", "m", "world", "origin of the held vessel"),
+    *_vector("object_x_axis", "1", "world", "its x axis: toward spout, lip or away from the handle", 1.0),
+    *_vector("object_z_axis", "1", "world", "its z axis: up when upright", 1.0),
+    *_vector("object_velocity", "m/s", "world", "velocity of its origin"),
+    *_vector("object_angular_velocity", "rad/s", "world", "its angular velocity"),
+    *_vector("object_in_reference", "m", "reference", "its origin seen from where the reference is now"),
+    *_vector("object_turn_in_reference", "rad", "reference", "rotation vector from there, up to symmetry", math.pi),
+    *(
+        entry
+        for ahead in LOOK_AHEAD_S
+        for entry in (
+            *_vector(f"reference_{round(1000 * ahead)}ms_offset", "m", "world", "way to the reference then"),
+            *_vector(f"reference_{round(1000 * ahead)}ms_turn", "rad", "world", "rotation vector to it", math.pi),
+        )
+    ),
+    Entry("object_tilt_rad", "rad", "world", 0.0, math.pi, "angle between the vessel's z axis and the vertical"),
+    Entry("held_fraction", "1", "vessel", 0.0, 1.0, "share of the particles in the held vessel: its fill"),
+    Entry("poured_fraction", "1", "receptacle", 0.0, 1.0, "share of the particles in the receptacle"),
+    Entry("spilled_fraction", "1", "world", 0.0, 1.0, "share of the particles in neither and below the rim"),
+    *_vector("receptacle_position", "m", "world", "origin of the receptacle; zeros without one"),
+    Entry("reference_phase", "1", "reference", 0.0, 1.0, "how far the reference has gone"),
+)
+AGENT_NAMES = tuple(entry.name for entry in AGENT_ENTRIES)
+ENVIRONMENT_NAMES = tuple(entry.name for entry in ENVIRONMENT_ENTRIES)
+# Rounding to 32 bits may pass a bound by so much.
+_ROUNDING = 1e-5
 
 
 def space(
@@ -45,13 +83,14 @@ def space(
 ) -> tuple[spaces.Dict, dict[str, tuple[str, ...]]]:
     """The observation space of a mode, and the name of every entry of its vectors."""
 
-    def vector(names: tuple[str, ...]) -> spaces.Box:
-        return spaces.Box(-np.inf, np.inf, (len(names),), np.float32)
+    def vector(entries: tuple[Entry, ...]) -> spaces.Box:
+        low, high = (np.array([getattr(entry, side) for entry in entries], np.float32) for side in ("low", "high"))
+        return spaces.Box(low - np.float32(_ROUNDING), high + np.float32(_ROUNDING), dtype=np.float32)
 
-    entries: dict[str, spaces.Space[Any]] = {"agent_pos": vector(AGENT_NAMES)}
+    entries: dict[str, spaces.Space[Any]] = {"agent_pos": vector(AGENT_ENTRIES)}
     names = {"agent_pos": AGENT_NAMES}
     if obs_mode != "pixels":
-        entries["environment_state"] = vector(ENVIRONMENT_NAMES)
+        entries["environment_state"] = vector(ENVIRONMENT_ENTRIES)
         names["environment_state"] = ENVIRONMENT_NAMES
     if obs_mode != "state":
         picture = spaces.Box(0, 255, (*image_size, 3), np.uint8)
@@ -59,82 +98,109 @@ def space(
     return spaces.Dict(entries), names
 
 
+@dataclass(frozen=True)
 class Targets:
-    """A reference prepared for fast comparison with the object's state at any of its knots."""
+    """A reference prepared for fast comparison with the object's state at any of its knots.
 
-    def __init__(self, reference: Reference) -> None:
-        self._position_m = np.ascontiguousarray(reference.T_world_object[:, :3, 3])
-        R = reference.T_world_object[:, :3, :3]
+    position_m (N, 3), twist (N, 6), R (N, 3, 3): as in the reference. images: (N, K, 4) quaternions wxyz of the
+    attitudes that count as the same under a discrete symmetry. axis (3,), axes (N, 3): the symmetry axis in the
+    object and at each knot in the world. continuous: whether the object may turn about it. ahead: look-ahead, knots.
+    """
+
+    position_m: Array
+    twist: Array
+    R: Array
+    images: Array
+    axis: Array
+    axes: Array
+    continuous: bool
+    ahead: NDArray[np.int64]
+
+    @staticmethod
+    def of(reference: Reference) -> Targets:
+        """Targets of a reference."""
+        R = np.ascontiguousarray(reference.T_world_object[:, :3, :3])
         symmetry = reference.symmetry
-        self._continuous = symmetry.order == 0
-        self._axis = np.asarray(symmetry.axis, float)
-        self._axes = R @ self._axis
-        # (N, K, 4): the attitudes that count as the same under a discrete symmetry.
-        images = R[:, None] @ (np.eye(3)[None] if self._continuous else symmetry.rotations())
-        self._quats = Rotation.from_matrix(images.reshape(-1, 3, 3)).as_quat(scalar_first=True)
-        self._quats = self._quats.reshape(len(R), -1, 4)
-        self._twist = reference.twist_world
-        self._last = len(reference) - 1
-        self._steps = [max(1, round(ahead * reference.control_hz)) for ahead in LOOK_AHEAD_S]
+        continuous = symmetry.order == 0
+        axis = np.array(symmetry.axis, float)
+        images = R[:, None] @ (np.eye(3)[None] if continuous else symmetry.rotations())
+        quats = Rotation.from_matrix(images.reshape(-1, 3, 3)).as_quat(scalar_first=True)
+        ahead = [max(1, round(ahead * reference.control_hz)) for ahead in LOOK_AHEAD_S]
+        return Targets(
+            np.ascontiguousarray(reference.T_world_object[:, :3, 3]),
+            np.ascontiguousarray(reference.twist_world, np.float64),
+            R,
+            np.ascontiguousarray(quats.reshape(len(R), -1, 4)),
+            axis,
+            R @ axis,
+            continuous,
+            np.array(ahead),
+        )
+
+    def shifted(self, reference: Reference) -> Targets:
+        """The same attitudes along the path of a reference that was only moved; saves most of `of`'s work."""
+        return replace(
+            self,
+            position_m=np.ascontiguousarray(reference.T_world_object[:, :3, 3]),
+            twist=np.ascontiguousarray(reference.twist_world, np.float64),
+        )
 
     def errors(self, index: int, position_m: Array, R: Array, twist: Array) -> tuple[float, float, float, float]:
         """Errors of position (m), rotation (rad, up to symmetry), linear (m/s) and angular velocity (rad/s) at a knot.
 
         R: (3, 3); twist: (6,) linear then angular, world axes. After the last knot the object should stand still.
         """
-        error = twist - self._twist[index] if index < self._last else twist
-        spin = error[3:]
-        if self._continuous:
-            axis = R @ self._axis
-            spin = spin - (spin @ axis) * axis
-        return (
-            _length(position_m - self._position_m[index]),
-            _length(self.turn_vector(index, R)),
-            _length(error[:3]),
-            _length(spin),
+        from .kernels import tracking_errors
+
+        out = np.empty(4)
+        tracking_errors(
+            index,
+            position_m,
+            R,
+            twist,
+            self.position_m,
+            self.twist,
+            self.images,
+            self.axis,
+            self.axes,
+            self.continuous,
+            out,
         )
+        position, rotation, linear, angular = out.tolist()
+        return position, rotation, linear, angular
 
     def turn_vector(self, index: int, R: Array) -> Array:
         """(3,) shortest rotation vector, world axes, that turns R (3, 3) into the knot's attitude up to symmetry."""
-        if self._continuous:
-            ax, ay, az = (R @ self._axis).tolist()
-            bx, by, bz = self._axes[index].tolist()
-            cross = np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
-            sine = _length(cross)
-            angle = math.atan2(sine, ax * bx + ay * by + az * bz)
-            if sine > 1e-9:
-                return np.asarray(cross * (angle / sine))
-            # Aligned, or opposite: then every axis across will do.
-            return np.zeros(3) if angle < 1.0 else angle * np.linalg.svd(np.array([[ax, ay, az]]))[2][1]
-        quat, local = np.empty(4), np.empty((len(self._quats[index]), 3))
-        mujoco.mju_mat2Quat(quat, R.ravel())
-        for vector, wanted in zip(local, self._quats[index], strict=True):
-            mujoco.mju_subQuat(vector, wanted, quat)
-        if len(local) > 1:
-            local = local[np.argmin(np.einsum("ij,ij->i", local, local))][None]
-        return np.asarray(R @ local[0])
+        from .kernels import turn_vector
+
+        out = np.empty(3)
+        turn_vector(R, self.images[index], self.axis, self.axes[index], self.continuous, out)
+        return out
 
     def environment_state(
-        self,
-        index: int,
-        position_m: Array,
-        R: Array,
-        twist: Array,
-        receptacle_m: Array,
-        fractions: tuple[float, float, float],
+        self, index: int, position_m: Array, R: Array, twist: Array, receptacle_m: Array, share: Array
     ) -> NDArray[np.float32]:
-        """The vector named by `ENVIRONMENT_NAMES`; fractions: held, poured, spilled."""
-        parts = [position_m, R[:, 0], R[:, 2], twist]
-        for step in self._steps:
-            ahead = min(index + step, self._last)
-            parts += [self._position_m[ahead] - position_m, self.turn_vector(ahead, R)]
-        tilt_rad = math.atan2(math.hypot(R[0, 2], R[1, 2]), R[2, 2])
-        parts += [np.array([tilt_rad, *fractions]), receptacle_m, np.array([index / self._last])]
-        return np.concatenate(parts).astype(np.float32)
+        """The vector named by `ENVIRONMENT_NAMES`; share: (3,) held, poured and spilled fractions."""
+        from .kernels import environment_vector
 
-
-def _length(vector: Array) -> float:
-    return math.sqrt(float(vector @ vector))
+        out = np.empty(len(ENVIRONMENT_NAMES), np.float32)
+        environment_vector(
+            index,
+            self.ahead,
+            position_m,
+            R,
+            twist,
+            receptacle_m,
+            share,
+            self.position_m,
+            self.images,
+            self.axis,
+            self.axes,
+            self.continuous,
+            self.R,
+            out,
+        )
+        return out
 
 
 def resampled(reference: Reference, control_hz: float) -> Reference:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -14,6 +16,9 @@ from .cameras import CAMERAS
 from .observations import resampled
 from .reference import Reference
 from .scene import MAX_PICTURE_PX
+
+if TYPE_CHECKING:
+    from ..extract.vessels import Vessel
 
 MAX_PARTICLES = 500
 # Longer steps let particles leak through walls.
@@ -26,12 +31,49 @@ def one_of(name: str, value: object, valid: Sequence[str]) -> None:
         raise UserError(f"{name} is {value!r}; choose {', '.join(valid)}")
 
 
-def preset[T](name: str, value: str | T, presets: Mapping[str, T], kind: type[T]) -> T:
-    """A preset by its name, or the value itself when it is of the kind already."""
+def preset[T](name: str, value: object, presets: Mapping[str, T], kind: type[Any]) -> T:
+    """A preset by its name, a value of the kind as it is, or one made from a dict of the dataclass's fields.
+
+    Dicts are what an environment's spec can be written to JSON with.
+    """
     if isinstance(value, kind):
-        return value
+        return cast(T, value)
+    if isinstance(value, Mapping):
+        known = [entry.name for entry in fields(kind)]
+        if unknown := sorted(set(map(str, value)) - set(known)):
+            raise UserError(f"{name} has no {', '.join(unknown)}; it has {', '.join(known)}")
+        return cast(T, kind(**{key: tuple(v) if isinstance(v, list) else v for key, v in value.items()}))
     one_of(name, value, tuple(presets))
     return presets[str(value)]
+
+
+@dataclass(frozen=True)
+class Termination:
+    """An episode is over when the object is farther than this from the reference, or so much is spilled; None: never.
+
+    position_m and rotation_rad are multiplied by the environment's tolerance.
+    """
+
+    position_m: float | None = None
+    rotation_rad: float | None = None
+    spilled_fraction: float | None = None
+
+    def __post_init__(self) -> None:
+        for entry in fields(self):
+            value = getattr(self, entry.name)
+            if value is not None and not value > 0.0:
+                raise UserError(f"termination {entry.name} is {value}; give a positive number, or None for never")
+
+    def ends(self, position_m: float, rotation_rad: float, spilled: float, tolerance: float) -> bool:
+        """Whether an episode with these errors is over."""
+        return (
+            (self.position_m is not None and position_m > self.position_m * tolerance)
+            or (self.rotation_rad is not None and rotation_rad > self.rotation_rad * tolerance)
+            or (self.spilled_fraction is not None and spilled > self.spilled_fraction)
+        )
+
+
+TERMINATIONS = {"never": Termination(), "lost": Termination(position_m=0.25, rotation_rad=0.8)}
 
 
 def offset(name: str, value: object) -> Array:
@@ -63,30 +105,34 @@ def timing(control_hz: float, timestep_s: float | None) -> tuple[float, int]:
     return timestep_s, steps
 
 
-def load_reference(reference: Reference | Path | str | None, control_hz: float) -> Reference:
-    """A reference from a file, as given, or the built-in one, at the control rate."""
-    if reference is None:
-        from .builtin import builtin_reference
+def load_reference(
+    reference: Reference | Path | str | None,
+    control_hz: float,
+    vessel: str | Path | Vessel | None = None,
+    receptacle: str | Path | Vessel | None = None,
+) -> Reference:
+    """A reference from a file, as given, or the built-in one, at the control rate and with these vessels."""
+    from .builtin import builtin_reference
+    from .substitution import resolve_vessel, with_receptacle, with_vessel
 
-        return builtin_reference(control_hz)
+    held = None if vessel is None else resolve_vessel(vessel, "vessel")
+    standing = None if receptacle is None else resolve_vessel(receptacle, "receptacle")
+    if reference is None:
+        return builtin_reference(control_hz, held, standing)
     if isinstance(reference, str | Path):
         reference = Reference.load(Path(reference))
     if not isinstance(reference, Reference):
         raise UserError(f"reference is a {type(reference).__name__}; give a Reference, a path or None")
-    return resampled(reference, control_hz)
+    reference = resampled(reference, control_hz)
+    if standing is not None:
+        reference = with_receptacle(reference, standing)
+    return reference if held is None else with_vessel(reference, held)
 
 
 def check_number(name: str, value: float, low: float, high: float) -> None:
     """Raise UserError unless low <= value <= high."""
     if not low <= value <= high:
         raise UserError(f"{name} is {value}; give a number from {low:g} to {high:g}")
-
-
-def limit(name: str, value: float | None) -> float | None:
-    """A positive threshold, or None."""
-    if value is not None and not value > 0.0:
-        raise UserError(f"{name} is {value}; give a positive number, or None to never terminate")
-    return value
 
 
 def particle_count(value: int) -> int:
@@ -103,7 +149,7 @@ def picture_size(name: str, size: Sequence[int]) -> tuple[int, int]:
     return int(size[0]), int(size[1])
 
 
-def check_cameras(cameras: Sequence[str], render_camera: str, render_mode: str | None) -> None:
+def check_cameras(cameras: Sequence[str], render_camera: str, render_mode: str | None) -> tuple[str, ...]:
     """Known and different camera names, and a render mode that exists."""
     if isinstance(cameras, str) or len(set(cameras)) != len(cameras) or len(cameras) == 0:
         raise UserError(f"cameras is {cameras!r}; give a tuple of different names out of {', '.join(CAMERAS)}")
@@ -111,3 +157,4 @@ def check_cameras(cameras: Sequence[str], render_camera: str, render_mode: str |
         one_of("camera", camera, CAMERAS)
     if render_mode is not None:
         one_of("render_mode", render_mode, ("rgb_array",))
+    return tuple(cameras)

@@ -1,4 +1,4 @@
-"""`PandaPour-v0`: a Panda holds a vessel full of particles and must pour as the reference does.
+"""`PandaPour-v0` and `PandaTrack-v0`: a Panda holds a vessel and must move it as the reference does.
 
 The world frame is the robot's base, z up, table top at z = 0. A step lasts one control period; the action given at step
 k is reached at its end, when the object should be at knot k + 1 of the reference.
@@ -8,22 +8,25 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import mujoco
 import numpy as np
-from gymnasium import spaces
 from numpy.typing import NDArray
 
 from ..extract.errors import UserError
-from ..extract.geometry import Array, make_pose
+from ..extract.geometry import Array
 from . import observations
-from .liquid import Count, Liquid, SpoutConduit, count_particles, fill_positions, level_share
+from .control import CONTROL_MODES, Control, ControlState
+from .diverged import PhysicsError, diverged_message
+from .kernels import HELD, POURED, SPILLED
+from .liquid import Liquid
 from .options import (
+    TERMINATIONS,
+    Termination,
     check_cameras,
     check_number,
-    limit,
     load_reference,
     offset,
     one_of,
@@ -32,47 +35,72 @@ from .options import (
     preset,
     timing,
 )
-from .panda import ARM_JOINTS, DQ_MAX_RAD_S, FINGER_JOINTS, Q_MAX_RAD, Q_MIN_RAD, SERVO_LEAD_S
-from .randomization import RANDOMIZATIONS, Randomization
+from .panda import Q_MAX_RAD, Q_MIN_RAD
+from .randomization import RANDOMIZATIONS, Draw, Randomization
 from .reference import Reference
-from .rendering import Cameras
-from .rewards import REWARD_MODES, TERMS, RewardConfig, StepErrors, term_table, weighted_terms
-from .scene import RECEPTACLE_BODY, VESSEL_BODY, Scene, build_scene
-from .vessel_geometry import gripper_half_width_m
+from .rewards import (
+    REWARD_MODES,
+    TERMS,
+    RewardConfig,
+    StepErrors,
+    limit_share,
+    term_table,
+    weighted_terms,
+    with_tolerance,
+)
+from .simulation import Simulation
+from .stage import Stage
+from .start import STARTS, ReferenceStart, StartSampler
+from .substitution import with_receptacle
 
-# The spout's conduit looks at the particles every so many physics steps.
-CONDUIT_STRIDE = 2
-SETTLE_AT_START_S = 1.5
-_PHYSICS = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+if TYPE_CHECKING:
+    from ..extract.vessels import Vessel
+
+# Following the reference means to stay this near to it to the end.
+TRACKED_M, TRACKED_RAD = 0.05, 0.3
+_OPTIONS = ("state", "start_offset_m", "receptacle_offset_m", "start_index")
+_STATE = (
+    "simulation",
+    "target",
+    "rate",
+    "step",
+    "worst_m",
+    "worst_rad",
+    "tolerance",
+    "draw",
+    "failure_rate",
+    "generator",
+)
 
 Observation = dict[str, Any]
 Info = dict[str, Any]
 
 
-class PhysicsError(RuntimeError):
-    """The simulation has produced values that are not finite; the message names seed, step and the mend."""
-
-
 class PandaPourEnv(gym.Env[Observation, NDArray[np.float32]]):
     """Reproduce a recorded pour with a Franka Panda.
 
-    reference: path of a `*.reference.npz`, a `Reference`, or None for a built-in pour of a mug into a bowl.
-    num_particles: 0 to 500. liquid: what the particles are like.
+    reference: path of a `*.reference.npz`, a `Reference`, or None for a built-in pour of `vessel` into `receptacle`.
+    vessel, receptacle: what takes the place of the reference's own (a mug and a bowl for a built-in pour): a library
+        category ("mug"), a seeded variant ("mug:3"), a mesh file, or a `Vessel`.
+    num_particles: 0 to 500. liquid: what the particles are like, a `Liquid` or a dict of its fields.
     control_hz: actions per second; a reference at another rate is resampled.
     timestep_s: physics step; must divide the control period; None takes the longest one up to 2 ms that does.
     obs_mode: "state" (agent_pos, environment_state), "pixels" (agent_pos, pixels) or "both".
     cameras: any of front, wrist, side; image_size: (height, width) in px.
-    control_mode: "joint_position": joint targets in rad; "joint_delta": their change in rad. Targets are kept inside
-        the joint limits and move no faster than the joints' speed limits.
-    reward_mode: dense, tracking, pour or sparse, or a `RewardConfig`.
-    randomization: none, low, or a `Randomization`.
+    control_mode: joint_position, joint_delta, ee_delta or torque; see `control.action_entries`. Targets are kept
+        inside the joint limits and move no faster than the joints' speed limits.
+    reward_mode: dense, tracking, pour or sparse, or a `RewardConfig`; tolerance: factor on the width of its tracking
+        kernels and on the termination thresholds, to be narrowed as a policy learns (`env.unwrapped.tolerance = ...`).
+    randomization: none, low, high, or a `Randomization`.
+    start: "beginning", "reference" (anywhere along it), or a `ReferenceStart`.
+    termination: "never", "lost" (0.25 m or 0.8 rad from the reference), or a `Termination`.
     settle_s: time after the reference's end in which the last reference pose is held.
-    success_poured_fraction, success_spilled_fraction: success means at least and at most so much.
-    max_position_error_m, max_rotation_error_rad: beyond these the episode is terminated; None never does.
+    success_poured_fraction, success_spilled_fraction: success means at least and at most so much; without particles,
+        to have stayed within 5 cm and 0.3 rad of the reference to its end.
     render_mode: None or "rgb_array"; render_size: (height, width) in px; render_camera: one of the cameras.
 
-    `reset(options=...)` takes `start_offset_m` and `receptacle_offset_m` (3,) in place of the random draw, or `state`
-    from `get_state()`. Raises UserError for every argument that makes no sense.
+    `reset(options=...)` takes `start_offset_m` and `receptacle_offset_m` (3,) and `start_index` in place of the random
+    draw, or `state` from `get_state()`. Raises UserError for every argument that makes no sense.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 25}  # noqa: RUF012 (Gymnasium's own convention)
@@ -86,65 +114,63 @@ class PandaPourEnv(gym.Env[Observation, NDArray[np.float32]]):
         cameras: Sequence[str] = ("front", "wrist"),
         image_size: tuple[int, int] = (224, 224),
         control_mode: str = "joint_position",
-        randomization: str | Randomization = "none",
+        randomization: str | Randomization | Mapping[str, Any] = "none",
         render_mode: str | None = None,
         render_size: tuple[int, int] = (480, 640),
         render_camera: str = "front",
-        reward_mode: str | RewardConfig = "dense",
-        liquid: Liquid | None = None,
+        reward_mode: str | RewardConfig | Mapping[str, Any] = "dense",
+        liquid: Liquid | Mapping[str, Any] | None = None,
         timestep_s: float | None = None,
         settle_s: float = 1.0,
         success_poured_fraction: float = 0.7,
         success_spilled_fraction: float = 0.1,
-        max_position_error_m: float | None = None,
-        max_rotation_error_rad: float | None = None,
+        vessel: str | Path | Vessel | None = None,
+        receptacle: str | Path | Vessel | None = None,
+        start: str | ReferenceStart | Mapping[str, Any] = "beginning",
+        termination: str | Termination | Mapping[str, Any] = "never",
+        tolerance: float = 1.0,
     ) -> None:
         one_of("obs_mode", obs_mode, ("state", "pixels", "both"))
-        one_of("control_mode", control_mode, ("joint_position", "joint_delta"))
-        check_cameras(cameras, render_camera, render_mode)
+        one_of("control_mode", control_mode, CONTROL_MODES)
         check_number("settle_s", settle_s, 0.0, 60.0)
         check_number("success_poured_fraction", success_poured_fraction, 0.0, 1.0)
         check_number("success_spilled_fraction", success_spilled_fraction, 0.0, 1.0)
-        self.max_position_error_m = limit("max_position_error_m", max_position_error_m)
-        self.max_rotation_error_rad = limit("max_rotation_error_rad", max_rotation_error_rad)
+        check_number("tolerance", tolerance, 1e-3, 1e3)
+        self.cameras = check_cameras(cameras, render_camera, render_mode)
         self.control_hz = float(control_hz)
         self.timestep_s, self._substeps = timing(self.control_hz, timestep_s)
         self.randomization = preset("randomization", randomization, RANDOMIZATIONS, Randomization)
-        self.reward_config = preset("reward_mode", reward_mode, REWARD_MODES, RewardConfig)
-        self.obs_mode, self.control_mode, self.cameras = obs_mode, control_mode, tuple(cameras)
-        self.image_size = picture_size("image_size", image_size)
-        self.render_size = picture_size("render_size", render_size)
+        self._reward_at_one = preset("reward_mode", reward_mode, REWARD_MODES, RewardConfig)
+        self.tolerance = tolerance
+        self.termination = preset("termination", termination, TERMINATIONS, Termination)
+        self._start = preset("start", start, STARTS, ReferenceStart)
+        self.obs_mode, self.control_mode = obs_mode, control_mode
+        self.image_size, self.render_size = (
+            picture_size("image_size", image_size),
+            picture_size("render_size", render_size),
+        )
         self.render_mode, self.render_camera = render_mode, render_camera
         self.success_poured_fraction, self.success_spilled_fraction = success_poured_fraction, success_spilled_fraction
         self.metadata = {**type(self).metadata, "render_fps": int(control_hz) if control_hz % 1 == 0 else control_hz}
 
-        self._base = load_reference(reference, self.control_hz)
-        self.reference = self._base
-        self._scene = build_scene(self._base, particle_count(num_particles), liquid or Liquid(), self.timestep_s)
-        self.model: mujoco.MjModel = self._scene.model
-        self.data = mujoco.MjData(self.model)
-        self._bind(self._scene)
-        self._seed: int | None = None
-        self._settled_m, self._settled_held = self._settle()
+        self._num_particles = particle_count(num_particles)
+        self._liquid: Liquid = preset("liquid", {} if liquid is None else liquid, {}, Liquid)
+        self._base = load_reference(reference, self.control_hz, vessel, receptacle)
+        self._control = Control(control_mode, self.control_hz, self._substeps)
+        self._stages: dict[int, Stage] = {}
+        self._stage = self._stage_for(-1)
+        scene = self.simulation.scene
         self._settle_steps = round(settle_s * self.control_hz)
         self._max_episode_steps = len(self._base) - 1 + self._settle_steps
-        self.task = f"pour from the {self._scene.vessel.category} into the {self._scene.receptacle.category}".replace(
-            "_", " "
-        )
+        self.task = f"pour from the {scene.vessel.category} into the {scene.receptacle.category}".replace("_", " ")
         self.task_description = self.task
-
-        self._delta_rad = DQ_MAX_RAD_S / self.control_hz
-        if control_mode == "joint_position":
-            self.action_space = spaces.Box(Q_MIN_RAD.astype(np.float32), Q_MAX_RAD.astype(np.float32))
-        else:
-            self.action_space = spaces.Box((-self._delta_rad).astype(np.float32), self._delta_rad.astype(np.float32))
+        self.action_space = self._control.space
         self.observation_space, self.observation_names = observations.space(obs_mode, self.cameras, self.image_size)
-        self._renderer = Cameras(self.model)
-        self._step_index = 0
-        self._target: Array = self._base.q_start_rad
-        self._target_speed: Array = np.zeros(7)
-        self._count: Count
-        self._begin(np.zeros(3), np.zeros(3))
+        self._starts = StartSampler(self._start or ReferenceStart(), len(self._base))
+        self._seed: int | None = None
+        self._worst_m: float
+        self._worst_rad: float
+        self._begin(Randomization().draw(np.random.default_rng(0)), 0)
 
     # ------------------------------------------------------------------ Gymnasium
 
@@ -154,94 +180,140 @@ class PandaPourEnv(gym.Env[Observation, NDArray[np.float32]]):
         if seed is not None:
             self._seed = seed
         options = dict(options or {})
-        if unknown := set(options) - {"state", "start_offset_m", "receptacle_offset_m"}:
-            raise UserError(
-                f"reset has no option {', '.join(sorted(unknown))}; it knows state, start_offset_m, receptacle_offset_m"
-            )
+        if unknown := sorted(set(options) - set(_OPTIONS)):
+            raise UserError(f"reset has no option {', '.join(unknown)}; it knows {', '.join(_OPTIONS)}")
         if "state" in options:
             self.set_state(options["state"])
-        else:
-            # Drawn even when overridden, so that an option does not shift the draws of later episodes.
-            start_m, receptacle_m = self.randomization.draw(self.np_random)
-            start_m = offset("start_offset_m", options.get("start_offset_m", start_m))
-            receptacle_m = offset("receptacle_offset_m", options.get("receptacle_offset_m", receptacle_m))
-            self._begin(start_m, receptacle_m)
+            return self._observation(), self._info(dict.fromkeys(TERMS, 0.0))
+        # All is drawn even when overridden, so that an option does not shift the draws of later episodes.
+        draw = self.randomization.draw(self.np_random)
+        index = self._starts.draw(self.np_random) if self._start is not None else 0
+        changes = {name: offset(name, options[name]) for name in _OPTIONS[1:3] if name in options}
+        if "start_index" in options:
+            index = int(options["start_index"])
+            check_number("reset option start_index", index, 0, len(self._base) - 1)
+        self._begin(Draw(**{**vars(draw), **changes}), index)
         return self._observation(), self._info(dict.fromkeys(TERMS, 0.0))
 
     def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, Info]:
         """Advance one control period."""
-        target = self._target_from(np.asarray(action, np.float64))
-        speed = (target - self._target) * self.control_hz
-        ramp = self._commands(target)
-        data, model, control, step = self.data, self.model, self.data.ctrl, mujoco.mj_step
-        for i in range(self._substeps):
-            control[:7] = ramp[i]
-            step(model, data)
-            if self._conduit is not None and i % CONDUIT_STRIDE == 0:
-                self._pour_through_spout(self._conduit)
-        self._target, last_speed, self._target_speed = target, self._target_speed, speed
+        commands, jerk = self.before_step(action)
+        self.simulation.advance(commands)
+        return self.after_step(jerk)
+
+    def before_step(self, action: NDArray[np.float32]) -> tuple[Array, float]:
+        """The arm's commands (substeps, 7) of a step and the action's jerkiness; `after_step` ends what this begins."""
+        self._before = (self.simulation.get_state(), self._control.state, action)
+        return self._control.advance(action)
+
+    def after_step(self, jerk: float) -> tuple[Observation, float, bool, bool, Info]:
+        """What `step` returns, once the physics has been advanced."""
+        simulation = self.simulation
         self._step_index += 1
-        before = self._count
-        self._refresh()
-        if not np.all(np.isfinite(data.qpos)):
-            raise PhysicsError(
-                f"the simulation diverged at step {self._step_index} of the episode with seed {self._seed}; "
-                "reset the environment, and use a smaller timestep_s or fewer particles if it happens again"
-            )
-        errors = self._errors(before, float(np.mean(((speed - last_speed) / (2 * DQ_MAX_RAD_S)) ** 2)))
-        terms = weighted_terms(errors, self.reward_config)
-        lost = (self.max_position_error_m is not None and errors.position_error_m > self.max_position_error_m) or (
-            self.max_rotation_error_rad is not None and errors.rotation_error_rad > self.max_rotation_error_rad
+        if not simulation.is_finite:
+            physics, control, action = self._before
+            state = {**self.get_state(), "simulation": physics, "target": control.target, "rate": control.rate}
+            state["step"] = self._step_index - 1
+            raise PhysicsError(diverged_message(state, action, self._seed, self._step_index))
+        _, poured, spilled = self._share
+        simulation.refresh()
+        self._look()
+        self._worst_m = max(self._worst_m, self._tracking_errors[0])
+        self._worst_rad = max(self._worst_rad, self._tracking_errors[1])
+        self_contact, table_contact = simulation.contacts()
+        errors = StepErrors(
+            *self._tracking_errors,
+            self._share[1] - poured,
+            self._share[2] - spilled,
+            jerk,
+            limit_share(simulation.data.qpos[:7], Q_MIN_RAD, Q_MAX_RAD),
+            float(self_contact > 0),
+            float(table_contact > 0),
+            float(self.is_success),
         )
+        terms = weighted_terms(errors, self.reward_config)
+        lost = self.termination.ends(*self._tracking_errors[:2], self._share[2], self._tolerance)
         truncated = self._step_index >= self._max_episode_steps
-        return self._observation(), float(sum(terms.values())), bool(lost), truncated, self._info(terms)
+        if self._start is not None and (lost or truncated):
+            self._starts.record(self._step_index, lost)
+        return self._observation(), sum(terms.values()), lost, truncated, self._info(terms)
 
     def render(self) -> NDArray[np.uint8] | None:
         """(H, W, 3) uint8 picture of `render_camera`, or None without a render mode."""
         if self.render_mode is None:
             return None
-        return self._renderer.picture(self.data, self.render_camera, self.render_size)
+        return self._stage.pictures.picture(self.data, self.render_camera, self.render_size)
 
     def close(self) -> None:
         """Free the rendering contexts."""
-        if hasattr(self, "_renderer"):
-            self._renderer.close()
+        for stage in getattr(self, "_stages", {}).values():
+            stage.pictures.close()
 
     # ------------------------------------------------------------------ state
 
     def get_state(self) -> dict[str, Any]:
         """Everything that the rest of the episode depends on; arrays are copies, the generator's state is JSON-like."""
-        physics = np.empty(mujoco.mj_stateSize(self.model, _PHYSICS))
-        mujoco.mj_getState(self.model, self.data, physics, _PHYSICS)
         return {
-            "physics": physics,
-            "start_offset_m": self._start_offset_m.copy(),
-            "receptacle_offset_m": self._receptacle_offset_m.copy(),
-            "target_rad": self._target.copy(),
-            "target_speed_rad_s": self._target_speed.copy(),
+            "simulation": self.simulation.get_state(),
+            "target": self._control.state.target.copy(),
+            "rate": self._control.state.rate.copy(),
             "step": self._step_index,
+            "worst_m": self._worst_m,
+            "worst_rad": self._worst_rad,
+            "tolerance": self._tolerance,
+            "draw": self._draw.to_state(),
+            "failure_rate": self._starts.failure_rate.copy(),
             "generator": self.np_random.bit_generator.state,
         }
 
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Continue exactly where `get_state()` was called, in this or an equal environment."""
-        names = ("physics", "start_offset_m", "receptacle_offset_m", "target_rad", "target_speed_rad_s", "step")
-        if missing := [name for name in (*names, "generator") if name not in state]:
+        if missing := [name for name in _STATE if name not in state]:
             raise UserError(f"the state lacks {', '.join(missing)}; take it from get_state()")
-        physics = np.asarray(state["physics"], np.float64)
-        if physics.shape != (mujoco.mj_stateSize(self.model, _PHYSICS),):
-            raise UserError(
-                f"the state holds {physics.size} physics values, this environment has "
-                f"{mujoco.mj_stateSize(self.model, _PHYSICS)}; it was taken with other arguments"
-            )
-        self._place(np.asarray(state["start_offset_m"], float), np.asarray(state["receptacle_offset_m"], float))
-        mujoco.mj_resetData(self.model, self.data)
-        mujoco.mj_setState(self.model, self.data, physics, _PHYSICS)
-        self._target = np.array(state["target_rad"], np.float64)
-        self._target_speed = np.array(state["target_speed_rad_s"], np.float64)
+        self._draw = Draw.from_state(state["draw"])
+        self._stage = self._stage_for(self._draw.receptacle_shape)
+        self._stage.take(self._draw)
+        self.simulation.set_state(state["simulation"])
+        self._control.state = ControlState(np.array(state["target"], float), np.array(state["rate"], float))
         self._step_index = int(state["step"])
+        self._worst_m, self._worst_rad = float(state["worst_m"]), float(state["worst_rad"])
+        self.tolerance = float(state["tolerance"])
+        self._starts.failure_rate = np.array(state["failure_rate"], float)
         self.np_random.bit_generator.state = state["generator"]
-        self._refresh()
+        self._look()
+
+    # ------------------------------------------------------------------ what one may look at
+
+    @property
+    def simulation(self) -> Simulation:
+        """The scene in motion."""
+        return self._stage.simulation
+
+    @property
+    def model(self) -> mujoco.MjModel:
+        """The compiled scene of this episode."""
+        return self.simulation.model
+
+    @property
+    def data(self) -> mujoco.MjData:
+        """Its state."""
+        return self.simulation.data
+
+    @property
+    def reference(self) -> Reference:
+        """This episode's reference: the environment's own, moved by what was drawn."""
+        return self._stage.reference
+
+    @property
+    def tolerance(self) -> float:
+        """Factor on the width of the tracking kernels and on the termination thresholds."""
+        return self._tolerance
+
+    @tolerance.setter
+    def tolerance(self, value: float) -> None:
+        check_number("tolerance", value, 1e-3, 1e3)
+        self._tolerance = float(value)
+        self.reward_config = with_tolerance(self._reward_at_one, self._tolerance)
 
     def reward_table(self) -> str:
         """The reward's terms, weights and scales in plain text."""
@@ -250,181 +322,136 @@ class PandaPourEnv(gym.Env[Observation, NDArray[np.float32]]):
     @property
     def T_world_object(self) -> Array:
         """(4, 4) pose of the held object now."""
-        return make_pose(self._vessel_R, self._vessel_xpos)
+        return self.simulation.T_world_vessel
 
     @property
     def T_world_receptacle(self) -> Array:
         """(4, 4) pose of the receptacle in this episode."""
-        return self._T_world_receptacle.copy()
+        return self.simulation.T_world_receptacle
 
     @property
     def particle_positions_m(self) -> Array:
         """(N, 3) centres of the particles in the world."""
-        return np.array(self._particle_qpos)
+        return np.array(self.simulation.particles_m)
+
+    @property
+    def particle_places(self) -> dict[str, NDArray[np.bool_]]:
+        """Masks (N,) of the particles that are held, poured and spilled; the others are in flight."""
+        where = self.simulation.where
+        return {"held": where == HELD, "poured": where == POURED, "spilled": where == SPILLED}
+
+    @property
+    def has_tracked(self) -> bool:
+        """Whether the object has stayed within 5 cm and 0.3 rad of the reference to its end."""
+        arrived = self._step_index >= len(self._base) - 1
+        return arrived and self._worst_m <= TRACKED_M and self._worst_rad <= TRACKED_RAD
+
+    @property
+    def is_success(self) -> bool:
+        """Whether the episode counts as a success so far; see `success_poured_fraction`."""
+        if self._num_particles == 0:
+            return self.has_tracked
+        _, poured, spilled = self._share
+        return bool(poured >= self.success_poured_fraction and spilled <= self.success_spilled_fraction)
 
     # ------------------------------------------------------------------ inside
 
-    def _bind(self, scene: Scene) -> None:
-        model, data = self.model, self.data
-        arm = [int(model.joint(name).qposadr[0]) for name in (*ARM_JOINTS, *FINGER_JOINTS)]
-        if arm != list(range(9)) or model.nq != 9 + 3 * scene.num_particles:
-            raise RuntimeError("the scene's joints are not in the order arm, fingers, particles")
-        self._vessel_id = int(model.body(VESSEL_BODY).id)
-        self._receptacle_id = int(model.body(RECEPTACLE_BODY).id)
-        # Views into the simulator's memory: always the pose of the last kinematics.
-        self._vessel_xpos, self._vessel_R = data.xpos[self._vessel_id], data.xmat[self._vessel_id].reshape(3, 3)
-        self._arm_axes, self._arm_anchors = data.xaxis[:7], data.xanchor[:7]
-        self._particle_qpos = data.qpos[9:].reshape(-1, 3)
-        self._particle_qvel = data.qvel[9:].reshape(-1, 3)
-        self._twist: Array = np.zeros(6)
-        self._fractions = (np.arange(1, self._substeps + 1) / self._substeps)[:, None]
-        self._gripper_m = gripper_half_width_m(scene.vessel, self._base.T_hand_object)
-        self._conduit = self._make_conduit(scene) if scene.vessel.outlet.kind == "spout" else None
+    def _stage_for(self, shape: int) -> Stage:
+        """The stage with the receptacle's seeded shape, or its own for -1; built when first needed."""
+        if shape not in self._stages:
+            reference = self._base
+            if shape >= 0:
+                from ..extract.vessels import make_vessel
 
-    def _make_conduit(self, scene: Scene) -> SpoutConduit | None:
-        if scene.num_particles == 0:
-            return None
-        share = level_share(scene.liquid, scene.vessel_cavity, scene.num_particles, scene.radius_m)
-        return SpoutConduit(scene.vessel, scene.vessel_cavity, scene.vessel_boxes, scene.radius_m, share)
+                reference = with_receptacle(reference, make_vessel(reference.receptacle().category, shape))
+            self._stages[shape] = Stage(
+                reference,
+                self._num_particles,
+                self._liquid,
+                self.timestep_s,
+                self._substeps,
+                self._control.actuation,
+            )
+        return self._stages[shape]
 
-    def _settle(self) -> tuple[Array, int]:
-        """(N, 3) resting places of the particles in the vessel's frame, and how many stay inside it."""
-        scene, data = self._scene, self.data
-        lattice = fill_positions(
-            scene.vessel_cavity, scene.vessel_boxes, scene.num_particles, scene.radius_m, scene.vessel.category
-        )
-        self._pose_arm(self._base.q_start_rad)
-        T = self.T_world_object
-        self._particle_qpos[:] = lattice @ T[:3, :3].T + T[:3, 3]
-        if scene.num_particles:
-            mujoco.mj_step(self.model, data, round(SETTLE_AT_START_S / self.timestep_s))
-            mujoco.mj_kinematics(self.model, data)
-            T = self.T_world_object
-        local = (self._particle_qpos - T[:3, 3]) @ T[:3, :3]
-        return local, int(np.count_nonzero(scene.vessel_cavity.contains(local)))
+    def _begin(self, draw: Draw, index: int) -> None:
+        self._draw, self._step_index = draw, index
+        self._stage = self._stage_for(draw.receptacle_shape)
+        target, rate = self._stage.begin(draw, index)
+        self._control.reset(target, rate)
+        self._worst_m, self._worst_rad = 0.0, 0.0
+        self._look()
 
-    def _pose_arm(self, q_rad: Array) -> None:
-        mujoco.mj_resetData(self.model, self.data)
-        self.data.qpos[:7] = self.data.ctrl[:7] = q_rad
-        self.data.qpos[7:9] = self.data.ctrl[7:9] = self._gripper_m
-        mujoco.mj_kinematics(self.model, self.data)
-
-    def _place(self, start_m: Array, receptacle_m: Array) -> None:
-        self._start_offset_m, self._receptacle_offset_m = start_m, receptacle_m
-        self.reference = self._base.warped(tuple(start_m), tuple(receptacle_m))
-        self._targets = observations.Targets(self.reference)
-        self._T_world_receptacle = self._scene.T_world_receptacle.copy()
-        self._T_world_receptacle[:3, 3] += receptacle_m
-        self.model.body_pos[self._receptacle_id] = self._T_world_receptacle[:3, 3]
-
-    def _begin(self, start_m: Array, receptacle_m: Array) -> None:
-        self._place(start_m, receptacle_m)
-        q_rad = self.reference.q_start_rad
-        self._pose_arm(q_rad)
-        T = self.T_world_object
-        self._particle_qpos[:] = self._settled_m @ T[:3, :3].T + T[:3, 3]
-        self._target, self._target_speed = q_rad.copy(), np.zeros(7)
-        self._step_index = 0
-        self._refresh()
-
-    def _refresh(self) -> None:
-        """Bring all that is derived up to the state; after a restored state it must be what it was before."""
-        mujoco.mj_kinematics(self.model, self.data)
-        self._read_twist()
-        self._count = self._counted()
-        self._tracking_errors = self._targets.errors(
-            self._reference_index, self._vessel_xpos, self._vessel_R, self._twist
-        )
-
-    def _read_twist(self) -> None:
-        # Seven joints move the vessel; the engine's own velocities would first go through every particle.
-        rates = self._arm_axes * self.data.qvel[:7, None]
-        arms = self._vessel_xpos - self._arm_anchors
-        self._twist[3:] = rates.sum(axis=0)
-        self._twist[0] = rates[:, 1] @ arms[:, 2] - rates[:, 2] @ arms[:, 1]
-        self._twist[1] = rates[:, 2] @ arms[:, 0] - rates[:, 0] @ arms[:, 2]
-        self._twist[2] = rates[:, 0] @ arms[:, 1] - rates[:, 1] @ arms[:, 0]
-
-    def _pour_through_spout(self, conduit: SpoutConduit) -> None:
-        T = self.T_world_object
-        if conduit.may_flow(T, self._particle_qpos):
-            self._read_twist()
-            conduit.move(self._particle_qpos, self._particle_qvel, T, self._twist)
-
-    def _target_from(self, action: Array) -> Array:
-        if action.shape != (7,) or not np.all(np.isfinite(action)):
-            raise UserError(f"the action must be 7 finite joint values in rad, got {action!r}")
-        wanted = action if self.control_mode == "joint_position" else self._target + action
-        step = np.clip(wanted - self._target, -self._delta_rad, self._delta_rad)
-        return np.clip(self._target + step, Q_MIN_RAD, Q_MAX_RAD)
-
-    def _commands(self, target: Array) -> Array:
-        """(substeps, 7) servo commands of one control period: straight to the target, leading by the servos' lag."""
-        way = target - self._target
-        return self._target + self._fractions * way + (SERVO_LEAD_S * self.control_hz) * way
-
-    def _counted(self) -> Count:
-        scene = self._scene
-        return count_particles(
-            self._particle_qpos,
-            scene.vessel_cavity,
-            self.T_world_object,
-            scene.receptacle_cavity,
-            self._T_world_receptacle,
+    def _look(self) -> None:
+        simulation = self.simulation
+        held, poured, spilled = simulation.share.tolist()
+        self._share: tuple[float, float, float] = (held, poured, spilled)
+        self._tracking_errors = self._stage.targets.errors(
+            self._reference_index, simulation.vessel_m, simulation.vessel_R, simulation.twist
         )
 
     @property
     def _reference_index(self) -> int:
-        return min(self._step_index, len(self.reference) - 1)
-
-    def _is_success(self) -> bool:
-        return (
-            self._count.poured_fraction >= self.success_poured_fraction
-            and self._count.spilled_fraction <= self.success_spilled_fraction
-        )
-
-    def _errors(self, before: Count, action_rate: float) -> StepErrors:
-        now = self._count
-        return StepErrors(
-            *self._tracking_errors,
-            now.poured_fraction - before.poured_fraction,
-            now.spilled_fraction - before.spilled_fraction,
-            action_rate,
-            float(self._is_success()),
-        )
+        return min(self._step_index, len(self._base) - 1)
 
     def _observation(self) -> Observation:
-        data = self.data
-        observation: Observation = {"agent_pos": np.concatenate([data.qpos[:7], data.qvel[:7]]).astype(np.float32)}
+        simulation, noise = self.simulation, self.randomization
+        agent = np.concatenate([simulation.data.qpos[:7], simulation.data.qvel[:7]])
+        observation: Observation = {}
+        if noise.noisy:
+            agent[:7] += self.np_random.normal(0.0, 1.0, 7) * noise.joint_noise_rad
+        observation["agent_pos"] = agent.astype(np.float32)
         if self.obs_mode != "pixels":
-            observation["environment_state"] = self._targets.environment_state(
-                self._reference_index,
-                self._vessel_xpos,
-                self._vessel_R,
-                self._twist,
-                self._T_world_receptacle[:3, 3],
-                (self._count.held_fraction, self._count.poured_fraction, self._count.spilled_fraction),
+            vessel_m, receptacle_m = simulation.vessel_m, simulation.receptacle_m
+            if noise.noisy:
+                off_m = self.np_random.normal(0.0, 1.0, (2, 3)) * noise.object_noise_m
+                vessel_m, receptacle_m = vessel_m + off_m[0], receptacle_m + off_m[1]
+            observation["environment_state"] = self._stage.targets.environment_state(
+                self._reference_index, vessel_m, simulation.vessel_R, simulation.twist, receptacle_m, simulation.share
             )
         if self.obs_mode != "state":
             observation["pixels"] = {
-                camera: self._renderer.picture(data, camera, self.image_size) for camera in self.cameras
+                camera: self._stage.pictures.picture(simulation.data, camera, self.image_size)
+                for camera in self.cameras
             }
         return observation
 
     def _info(self, terms: dict[str, float]) -> Info:
+        held, poured, spilled = self._share
         position_m, rotation_rad, _, _ = self._tracking_errors
+        scene = self.simulation.scene
         info: Info = {
             "reward_terms": terms,
-            "poured_fraction": self._count.poured_fraction,
-            "spilled_fraction": self._count.spilled_fraction,
-            "held_fraction": self._count.held_fraction,
+            "poured_fraction": poured,
+            "spilled_fraction": spilled,
+            "held_fraction": held,
             "position_error_m": position_m,
             "rotation_error_rad": rotation_rad,
             "reference_index": self._reference_index,
-            "is_success": self._is_success(),
-            "outlet": "spout_conduit" if self._scene.vessel.outlet.kind == "spout" else "lip",
+            "is_success": self.is_success,
+            "outlet": "spout_conduit" if scene.vessel.outlet.kind == "spout" else "lip",
         }
-        if self._settled_held < self._scene.num_particles:
-            lost = self._scene.num_particles - self._settled_held
+        if self.simulation.settled_held < scene.num_particles:
+            lost = scene.num_particles - self.simulation.settled_held
             info["start_warning"] = f"{lost} particles run out in the start pose: the vessel is tilted or too full"
         return info
+
+
+class PandaTrackEnv(PandaPourEnv):
+    """The same without liquid: follow the reference, as fast as the arm alone can be simulated.
+
+    Takes `PandaPourEnv`'s arguments but `num_particles` and `liquid`. The reward is for tracking alone, an episode
+    that has lost the object ends, and success is to have stayed within 5 cm and 0.3 rad to the end.
+    """
+
+    def __init__(
+        self,
+        reference: Reference | Path | str | None = None,
+        *,
+        reward_mode: str | RewardConfig | Mapping[str, Any] = "tracking",
+        termination: str | Termination | Mapping[str, Any] = "lost",
+        **arguments: Any,
+    ) -> None:
+        if forbidden := sorted({"num_particles", "liquid"} & set(arguments)):
+            raise UserError(f"PandaTrack-v0 has no liquid, so no {' and '.join(forbidden)}; make PandaPour-v0 for that")
+        super().__init__(reference, 0, reward_mode=reward_mode, termination=termination, **arguments)

@@ -10,5 +10,6 @@ def register_envs() -> None:
     except ModuleNotFoundError:  # the extract package is usable on its own
         return
 
-    if "PandaPour-v0" not in registry:
-        register(id="PandaPour-v0", entry_point="vid2demo.envs.pouring:PandaPourEnv")
+    for task in ("Pour", "Track"):
+        if f"Panda{task}-v0" not in registry:
+            register(id=f"Panda{task}-v0", entry_point=f"vid2demo.envs.pouring:Panda{task}Env")

@@ -1,16 +1,22 @@
 """Reward: small pure terms, their weights and scales in one frozen dataclass, and a table a person can print.
 
 The reward of a step is the sum of weight x term. Tracking terms lie in [0, 1], so that their weights are their share;
-pouring terms pay for particles as they arrive, so that over an episode they add up to weight x final fraction.
+pouring terms pay for particles as they arrive, so that over an episode they add up to weight x final fraction. One
+number, the tolerance, widens or narrows all tracking kernels at once: a curriculum begins wide and ends at 1 or below.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
 
 from ..extract.errors import UserError
+from ..extract.geometry import Array
+
+JOINT_MARGIN_RAD = 0.1
 
 
 @dataclass(frozen=True)
@@ -20,7 +26,9 @@ class StepErrors:
     position_error_m, linear_velocity_error_m_s: Euclidean; rotation_error_rad: smallest over the object's symmetry;
     angular_velocity_error_rad_s: without the turn about a continuous symmetry axis, which nobody can see.
     poured_gain, spilled_gain: change of the fractions in this step. action_rate: mean square change of the joint
-    targets' speed since the last step, over twice the joints' speed limits. success: 1 when the episode counts as one.
+    targets' speed since the last step, over twice the joints' speed limits. limit_share: 0 while every joint keeps
+    `JOINT_MARGIN_RAD` from its limits, 1 when one is there. self_contact, table_contact: 1 while the arm touches
+    itself, and while arm or held vessel touch the table. success: 1 when the episode counts as one.
     """
 
     position_error_m: float
@@ -30,6 +38,9 @@ class StepErrors:
     poured_gain: float
     spilled_gain: float
     action_rate: float
+    limit_share: float
+    self_contact: float
+    table_contact: float
     success: float
 
 
@@ -44,6 +55,9 @@ class RewardConfig:
     poured: float = 20.0
     spilled: float = -10.0
     action_rate: float = -0.1
+    joint_limits: float = -0.1
+    self_contact: float = -0.5
+    table_contact: float = -0.5
     success: float = 0.0
     position_scale_m: float = 0.1
     rotation_scale_rad: float = 0.4
@@ -61,11 +75,12 @@ class RewardConfig:
 
 _NO_TRACKING = {"position": 0.0, "rotation": 0.0, "linear_velocity": 0.0, "angular_velocity": 0.0}
 _NO_POUR = {"poured": 0.0, "spilled": 0.0}
+_NO_CARE = {"action_rate": 0.0, "joint_limits": 0.0, "self_contact": 0.0, "table_contact": 0.0}
 REWARD_MODES = {
     "dense": RewardConfig(),
     "tracking": RewardConfig(**_NO_POUR),
     "pour": RewardConfig(**_NO_TRACKING),
-    "sparse": RewardConfig(**_NO_TRACKING, **_NO_POUR, action_rate=0.0, success=1.0),
+    "sparse": RewardConfig(**_NO_TRACKING, **_NO_POUR, **_NO_CARE, success=1.0),
 }
 
 
@@ -109,21 +124,62 @@ def action_rate(errors: StepErrors, config: RewardConfig) -> float:
     return errors.action_rate
 
 
+def joint_limits(errors: StepErrors, config: RewardConfig) -> float:
+    """Nearness of the worst joint to its limit."""
+    return errors.limit_share
+
+
+def self_contact(errors: StepErrors, config: RewardConfig) -> float:
+    """1 while the arm touches itself."""
+    return errors.self_contact
+
+
+def table_contact(errors: StepErrors, config: RewardConfig) -> float:
+    """1 while the arm or the held vessel touches the table."""
+    return errors.table_contact
+
+
 def success(errors: StepErrors, config: RewardConfig) -> float:
-    """1 while enough is poured and little spilled."""
+    """1 while the episode counts as a success."""
     return errors.success
 
 
 Term = Callable[[StepErrors, RewardConfig], float]
 TERMS: dict[str, Term] = {
     function.__name__: function
-    for function in (position, rotation, linear_velocity, angular_velocity, poured, spilled, action_rate, success)
+    for function in (
+        position,
+        rotation,
+        linear_velocity,
+        angular_velocity,
+        poured,
+        spilled,
+        action_rate,
+        joint_limits,
+        self_contact,
+        table_contact,
+        success,
+    )
 }
 
 
 def weighted_terms(errors: StepErrors, config: RewardConfig) -> dict[str, float]:
     """weight x term for every term; their sum is the reward."""
     return {name: getattr(config, name) * term(errors, config) for name, term in TERMS.items()}
+
+
+def with_tolerance(config: RewardConfig, tolerance: float) -> RewardConfig:
+    """The same reward with all tracking kernels `tolerance` times as wide."""
+    scales = {
+        entry.name: getattr(config, entry.name) * tolerance for entry in fields(config) if "_scale_" in entry.name
+    }
+    return replace(config, **scales)
+
+
+def limit_share(q_rad: Array, low_rad: Array, high_rad: Array) -> float:
+    """0 while every joint of q (7,) keeps `JOINT_MARGIN_RAD` from its limits, rising linearly to 1 at a limit."""
+    margin_rad = float(np.minimum(q_rad - low_rad, high_rad - q_rad).min())
+    return min(max(1.0 - margin_rad / JOINT_MARGIN_RAD, 0.0), 1.0)
 
 
 def term_table(config: RewardConfig) -> str:

@@ -102,6 +102,13 @@ class Cavity:
         offsets = self.support_m[:-1] - slope * self.z_m[:-1, None] + self.normals @ self.axis_xy_m
         return np.ascontiguousarray(normals.reshape(-1, 3).T), offsets.ravel()
 
+    @cached_property
+    def arrays(self) -> tuple[Array, Array, Array, Array]:
+        """Levels, supports, normals and axis, laid out for `kernels.sort_particles`."""
+        parts = (self.z_m, self.support_m, self.normals, self.axis_xy_m)
+        z, support, normals, axis = (np.ascontiguousarray(part, np.float64) for part in parts)
+        return z, support, normals, axis
+
     @property
     def rim_m(self) -> float:
         """Height of the rim, or of the underside of the lid."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import mujoco
 import numpy as np
 import pytest
 from vid2demo.envs.kinematics import arm_seeds, panda_chain, solve_ik
@@ -40,32 +39,30 @@ def escapes(env: PandaPourEnv, seed: int) -> tuple[int, int]:
     """Shake and turn over; how many went through a wall and how many over the rim, checked every 4 ms."""
     rng = np.random.default_rng(seed)
     env.reset(seed=seed)
-    env._conduit = None  # what leaves by the spout would count as leaked
+    simulation = env.simulation
+    simulation._conduit = None  # what leaves by the spout would count as leaked
     q_start = env.reference.q_start_rad
     amplitude, hz, phase = rng.uniform(0.05, 0.2, 7), rng.uniform(1.5, 4.0, 7), rng.uniform(0, 2 * np.pi, 7)
     turn_rad, turn_s = np.deg2rad(rng.uniform(100, 160)), rng.uniform(0.5, 1.0)
     turn_rad *= -1.0 if q_start[6] + turn_rad > 2.85 else 1.0
-    cavity, radius_m = env._scene.vessel_cavity, env._scene.radius_m
-    inside = np.full(env._scene.num_particles, True)
+    cavity, radius_m = simulation.scene.vessel_cavity, simulation.scene.radius_m
+    inside = np.full(simulation.scene.num_particles, True)
     through = 0
     commands = []
     for k in range(round((SHAKE_S + turn_s + AFTER_S) * env.control_hz)):
         t = k / env.control_hz
         wanted = q_start + amplitude * (np.sin(2 * np.pi * hz * t + phase) - np.sin(phase))
         wanted[6] = q_start[6] + turn_rad * minimum_jerk(np.array((t - SHAKE_S) / turn_s))
-        target = env._target_from(wanted)
-        commands.append(env._commands(target))
-        env._target = target
+        commands.append(env._control.advance(wanted)[0].copy())
     for k, command in enumerate(np.concatenate(commands)):
-        env.data.ctrl[:7] = command
-        mujoco.mj_step(env.model, env.data)
+        simulation.advance([command])
         if k % 2 == 0:
-            mujoco.mj_kinematics(env.model, env.data)
+            simulation.refresh()
             T = env.T_world_object
             local = (env.particle_positions_m - T[:3, 3]) @ T[:3, :3]
             # Outside means clear of the hollow and of the walls: a hard hit sinks in for a moment and comes back.
             left = np.flatnonzero(inside & (cavity.clearance_m(local) < -radius_m))
-            left = left[np.min([box.distance_m(local[left]) for box in env._scene.vessel_boxes], axis=0) > 0.0]
+            left = left[np.min([box.distance_m(local[left]) for box in simulation.scene.vessel_boxes], axis=0) > 0.0]
             through += int(np.count_nonzero(local[left, 2] < cavity.rim_m - 1.5 * radius_m))
             inside[left] = False
     return through, int(np.count_nonzero(~inside))
@@ -90,11 +87,12 @@ def test_no_category_leaks(category: str) -> None:
 def test_what_falls_hard_into_a_receptacle_stays_in_it(category: str) -> None:
     env = PandaPourEnv(still_reference("gooseneck_kettle", category), num_particles=60)
     env.reset(seed=0)
-    cavity, T = env._scene.receptacle_cavity, env.T_world_receptacle
-    boxes = collision_boxes(env._scene.receptacle, cavity)
-    places = fill_positions(cavity, boxes, 60, env._scene.radius_m, category)
-    env._particle_qpos[:] = places @ T[:3, :3].T + T[:3, 3]
-    env._particle_qvel[:] = [0.2, 0.1, -1.5]  # a fall from 11 cm
+    simulation, scene = env.simulation, env.simulation.scene
+    cavity, T = scene.receptacle_cavity, env.T_world_receptacle
+    boxes = collision_boxes(scene.receptacle, cavity)
+    places = fill_positions(cavity, boxes, 60, scene.radius_m, category)
+    simulation.particles_m[:] = places @ T[:3, :3].T + T[:3, 3]
+    simulation.particle_velocities_m_s[:] = [0.2, 0.1, -1.5]  # a fall from 11 cm
     for _ in range(15):
         _, _, _, _, info = env.step(env.reference.q_start_rad.astype(np.float32))
     assert info["poured_fraction"] > 0.95

@@ -23,7 +23,7 @@ SYMMETRIES = [Symmetry(order=1), Symmetry(order=2), Symmetry(order=4), Symmetry(
 @pytest.mark.parametrize("symmetry", SYMMETRIES, ids=lambda s: f"{s.order}{s.axis}")
 def test_turn_leads_into_the_reference_and_is_as_long_as_the_error(symmetry: Symmetry) -> None:
     reference = swinging(symmetry)
-    targets = Targets(reference)
+    targets = Targets.of(reference)
     for index, R in enumerate(Rotation.random(20, rng=np.random.default_rng(1)).as_matrix()):
         wanted = reference.T_world_object[index, :3, :3]
         expected = float(symmetry.error_rad(R, wanted))
@@ -37,12 +37,12 @@ def test_turn_leads_into_the_reference_and_is_as_long_as_the_error(symmetry: Sym
 def test_the_reference_itself_has_no_error(symmetry: Symmetry) -> None:
     reference = swinging(symmetry)
     T = reference.T_world_object[7]
-    errors = Targets(reference).errors(7, T[:3, 3], T[:3, :3], reference.twist_world[7])
+    errors = Targets.of(reference).errors(7, T[:3, 3], T[:3, :3], reference.twist_world[7])
     np.testing.assert_allclose(errors, 0.0, atol=1e-6)
 
 
 def test_an_upside_down_round_vessel_is_half_a_turn_off() -> None:
-    targets = Targets(swinging(Symmetry(order=0)))
+    targets = Targets.of(swinging(Symmetry(order=0)))
     upside_down = np.diag([1.0, -1.0, -1.0])
     turn = targets.turn_vector(0, upside_down)
     assert np.linalg.norm(turn) == pytest.approx(np.pi)
@@ -53,22 +53,23 @@ def test_spin_about_a_round_vessels_axis_is_no_error() -> None:
     reference = swinging(Symmetry(order=0))
     T = reference.T_world_object[7]
     spun = reference.twist_world[7] + np.concatenate([np.zeros(3), 3.0 * T[:3, 2]])
-    assert Targets(reference).errors(7, T[:3, 3], T[:3, :3], spun)[3] == pytest.approx(0.0, abs=1e-9)
+    assert Targets.of(reference).errors(7, T[:3, 3], T[:3, :3], spun)[3] == pytest.approx(0.0, abs=1e-9)
     uneven = swinging(Symmetry(order=1))
-    assert Targets(uneven).errors(7, T[:3, 3], T[:3, :3], spun)[3] == pytest.approx(3.0)
+    assert Targets.of(uneven).errors(7, T[:3, 3], T[:3, :3], spun)[3] == pytest.approx(3.0)
 
 
 def test_after_the_end_the_object_should_stand_still() -> None:
     reference = swinging(Symmetry(order=1))
     T = reference.T_world_object[-1]
-    errors = Targets(reference).errors(19, T[:3, 3], T[:3, :3], np.array([0.3, 0.4, 0, 0, 0, 2.0]))
+    errors = Targets.of(reference).errors(19, T[:3, 3], T[:3, :3], np.array([0.3, 0.4, 0, 0, 0, 2.0]))
     np.testing.assert_allclose(errors[2:], [0.5, 2.0])
 
 
 def test_environment_state_has_one_value_for_every_name() -> None:
     reference = swinging(Symmetry(order=1))
     T = reference.T_world_object[0]
-    vector = Targets(reference).environment_state(0, T[:3, 3], T[:3, :3], np.zeros(6), np.ones(3), (1.0, 0.0, 0.0))
+    share = np.array([1.0, 0.0, 0.0])
+    vector = Targets.of(reference).environment_state(0, T[:3, 3], T[:3, :3], np.zeros(6), np.ones(3), share)
     assert vector.shape == (len(ENVIRONMENT_NAMES),)
     assert vector.dtype == np.float32
     assert len(set(ENVIRONMENT_NAMES)) == len(ENVIRONMENT_NAMES)

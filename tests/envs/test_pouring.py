@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import pickle
+import re
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -13,9 +14,10 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 from vid2demo.envs.builtin import pour_reference
+from vid2demo.envs.diverged import PhysicsError, read_diverged_state
 from vid2demo.envs.liquid import Liquid
 from vid2demo.envs.panda import DQ_MAX_RAD_S, Q_MAX_RAD, Q_MIN_RAD
-from vid2demo.envs.pouring import PandaPourEnv, PhysicsError
+from vid2demo.envs.pouring import PandaPourEnv
 from vid2demo.envs.randomization import Randomization
 from vid2demo.envs.reference import Reference
 from vid2demo.extract.errors import UserError
@@ -39,7 +41,7 @@ def equal(a: Any, b: Any) -> bool:
     return bool(np.array_equal(a, b))
 
 
-@pytest.mark.parametrize("control_mode", ["joint_position", "joint_delta"])
+@pytest.mark.parametrize("control_mode", ["joint_position", "joint_delta", "ee_delta", "torque"])
 @pytest.mark.parametrize("obs_mode", ["state", "pixels", "both"])
 def test_gymnasium_accepts_every_mode(mug_pour: Reference, obs_mode: str, control_mode: str) -> None:
     made = gym.make(
@@ -117,8 +119,8 @@ def test_a_state_of_another_environment_is_refused(env: PandaPourEnv, kettle_pou
     state = env.get_state()
     with pytest.raises(UserError, match="taken with other arguments"):
         PandaPourEnv(kettle_pour, num_particles=3).set_state(state)
-    with pytest.raises(UserError, match="lacks physics, step"):
-        env.set_state({k: v for k, v in state.items() if k not in ("physics", "step")})
+    with pytest.raises(UserError, match="lacks simulation, step"):
+        env.set_state({k: v for k, v in state.items() if k not in ("simulation", "step")})
 
 
 def test_following_the_reference_pours_the_mug_into_the_bowl(mug_pour: Reference, play: Play) -> None:
@@ -143,9 +145,9 @@ def test_following_the_reference_pours_the_kettle_through_its_spout(
     seen = []
     env.reset(seed=0)
     for action in actions_of(kettle_pour, env._max_episode_steps):
-        held = env._count.held.copy()
+        held = env.particle_places["held"]
         _, _, _, _, info = env.step(action)
-        for i in np.flatnonzero(held & ~env._count.held):
+        for i in np.flatnonzero(held & ~env.particle_places["held"]):
             T = env.T_world_object
             seen.append(np.linalg.norm(env.particle_positions_m[i] - (T[:3, :3] @ spout_tip + T[:3, 3])))
     assert info["outlet"] == "spout_conduit"
@@ -177,7 +179,7 @@ def test_the_objects_velocity_is_the_engines(env: PandaPourEnv, actions_of: Acti
     body = env.model.body("vessel").id
     mujoco.mj_objectVelocity(env.model, env.data, mujoco.mjtObj.mjOBJ_XBODY, body, engine, 0)
     assert np.linalg.norm(engine[:3]) > 0.1
-    np.testing.assert_allclose(env._twist, np.roll(engine, 3), atol=1e-9)
+    np.testing.assert_allclose(env.simulation.twist, np.roll(engine, 3), atol=1e-9)
 
 
 def test_reward_is_the_sum_of_its_terms_and_info_says_how_it_stands(env: PandaPourEnv, actions_of: ActionsOf) -> None:
@@ -230,18 +232,18 @@ def test_options_move_start_and_receptacle_in_place_of_the_draw(env: PandaPourEn
 def test_joint_targets_keep_speed_and_position_limits(mug_pour: Reference) -> None:
     env = PandaPourEnv(mug_pour, num_particles=0)
     env.reset(seed=0)
-    previous = env._target
+    previous = env._control.state.target
     for corner in (Q_MAX_RAD, Q_MIN_RAD):
         for _ in range(40):
             env.step((corner * 1.5).astype(np.float32))
-            assert np.all(np.abs(env._target - previous) <= DQ_MAX_RAD_S / 25 + 1e-12)
-            assert np.all(env._target >= Q_MIN_RAD)
-            assert np.all(env._target <= Q_MAX_RAD)
-            previous = env._target
+            assert np.all(np.abs(env._control.state.target - previous) <= DQ_MAX_RAD_S / 25 + 1e-12)
+            assert np.all(env._control.state.target >= Q_MIN_RAD)
+            assert np.all(env._control.state.target <= Q_MAX_RAD)
+            previous = env._control.state.target
     assert np.all(np.isfinite(env.data.qpos))
 
 
-@pytest.mark.parametrize("control_mode", ["joint_position", "joint_delta"])
+@pytest.mark.parametrize("control_mode", ["joint_position", "joint_delta", "ee_delta", "torque"])
 def test_random_actions_leave_everything_finite(mug_pour: Reference, control_mode: str) -> None:
     env = PandaPourEnv(mug_pour, num_particles=FEW, control_mode=control_mode)
     env.action_space.seed(0)
@@ -272,19 +274,25 @@ def test_a_diverged_simulation_is_reported_with_seed_and_step(mug_pour: Referenc
     env.reset(seed=5)
     env.step(mug_pour.q_start_rad)
     env.data.qvel[3] = np.nan
-    with pytest.raises(PhysicsError, match="step 2 of the episode with seed 5"):
+    with pytest.raises(PhysicsError, match="step 2 of the episode with seed 5") as caught:
         env.step(mug_pour.q_start_rad)
+    state, action = read_diverged_state(re.search(r"are in (\S+)", str(caught.value))[1])
+    np.testing.assert_array_equal(action, mug_pour.q_start_rad)
+    env.set_state(state)
+    assert np.isnan(env.data.qvel[3]), "the file leads back to just before the step"
+    with pytest.raises(UserError, match="holds no diverged state"):
+        read_diverged_state(tmp_path / "nowhere.npz")
 
 
 @pytest.mark.parametrize("action", [np.zeros(6), np.full(7, np.nan)])
 def test_malformed_actions_are_refused(env: PandaPourEnv, action: np.ndarray) -> None:
     env.reset(seed=0)
-    with pytest.raises(UserError, match="7 finite joint values"):
+    with pytest.raises(UserError, match="7 finite numbers"):
         env.step(action)
 
 
 def test_thresholds_end_an_episode_that_has_lost_the_object(mug_pour: Reference) -> None:
-    env = PandaPourEnv(mug_pour, num_particles=0, max_position_error_m=0.05)
+    env = PandaPourEnv(mug_pour, num_particles=0, termination={"position_m": 0.05})
     env.reset(seed=0)
     for _ in range(60):
         _, _, terminated, truncated, info = env.step(mug_pour.q_start_rad.astype(np.float32))
@@ -304,7 +312,7 @@ def test_files_other_rates_and_kettles_without_liquid_work(tmp_path: Path, kettl
         _, info = env.reset(seed=0)
         assert info["outlet"] == "spout_conduit"
         assert not info["is_success"]
-        assert env.model.opt.timestep * env._substeps == pytest.approx(0.02)
+        assert env.model.opt.timestep * env.simulation.substeps == pytest.approx(0.02)
 
 
 def test_a_start_that_spills_is_said_in_info(mug_pour: Reference, actions_of: ActionsOf) -> None:
@@ -321,7 +329,7 @@ def test_a_start_that_spills_is_said_in_info(mug_pour: Reference, actions_of: Ac
     ("arguments", "message"),
     [
         ({"obs_mode": "images"}, "obs_mode is 'images'; choose state, pixels, both"),
-        ({"control_mode": "torque"}, "control_mode is 'torque'"),
+        ({"control_mode": "force"}, "control_mode is 'force'"),
         ({"render_mode": "human"}, "render_mode is 'human'"),
         ({"cameras": ("front", "top")}, "camera is 'top'; choose front, wrist, side"),
         ({"cameras": "front"}, "give a tuple"),
@@ -336,7 +344,12 @@ def test_a_start_that_spills_is_said_in_info(mug_pour: Reference, actions_of: Ac
         ({"reward_mode": "kind"}, "reward_mode is 'kind'; choose dense, tracking, pour, sparse"),
         ({"settle_s": -1.0}, "settle_s is -1.0"),
         ({"success_poured_fraction": 70}, "success_poured_fraction is 70"),
-        ({"max_position_error_m": 0.0}, "max_position_error_m is 0.0"),
+        ({"termination": {"position_m": 0.0}}, "termination position_m is 0.0"),
+        ({"termination": {"far": 1.0}}, "termination has no far; it has position_m"),
+        ({"start": "middle"}, "start is 'middle'; choose beginning, reference"),
+        ({"tolerance": 0.0}, "tolerance is 0.0"),
+        ({"vessel": "mug:x"}, "vessel is 'mug:x'"),
+        ({"receptacle": "mugg"}, "unknown vessel category 'mugg'"),
         ({"reference": 3}, "reference is a int"),
         ({"reference": "nowhere.reference.npz"}, "nowhere.reference.npz does not exist"),
         ({"num_particles": 500, "liquid": Liquid(radius_m=0.01)}, "holds at most"),

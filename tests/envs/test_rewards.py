@@ -3,18 +3,30 @@ from __future__ import annotations
 import dataclasses
 import math
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from vid2demo.envs.randomization import RANDOMIZATIONS, Randomization
-from vid2demo.envs.rewards import REWARD_MODES, TERMS, RewardConfig, StepErrors, kernel, term_table, weighted_terms
+from vid2demo.envs.rewards import (
+    JOINT_MARGIN_RAD,
+    REWARD_MODES,
+    TERMS,
+    RewardConfig,
+    StepErrors,
+    kernel,
+    limit_share,
+    term_table,
+    weighted_terms,
+    with_tolerance,
+)
 from vid2demo.extract.errors import UserError
 
-PERFECT = StepErrors(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+PERFECT = StepErrors(*[0.0] * 11)
 numbers = st.floats(0.0, 1e6)
 
 
-@given(st.builds(StepErrors, *[numbers] * 4, *[st.floats(-1, 1)] * 2, numbers, st.sampled_from([0.0, 1.0])))
+@given(st.builds(StepErrors, *[numbers] * 4, *[st.floats(-1, 1)] * 2, numbers, *[st.floats(0, 1)] * 4))
 def test_terms_are_finite_and_tracking_stays_within_its_share(errors: StepErrors) -> None:
     config = RewardConfig()
     terms = weighted_terms(errors, config)
@@ -38,11 +50,12 @@ def test_perfect_tracking_earns_one_and_a_whole_pour_its_weight() -> None:
 
 
 def test_modes_pay_for_what_they_are_named_after() -> None:
-    busy = StepErrors(0.05, 0.1, 0.1, 0.1, 0.2, 0.1, 0.3, 1.0)
+    busy = StepErrors(0.05, 0.1, 0.1, 0.1, 0.2, 0.1, 0.3, 0.5, 1.0, 1.0, 1.0)
     paid = {mode: {k for k, v in weighted_terms(busy, config).items() if v} for mode, config in REWARD_MODES.items()}
     assert paid["sparse"] == {"success"}
-    assert paid["pour"] == {"poured", "spilled", "action_rate"}
-    assert paid["tracking"] == {"position", "rotation", "linear_velocity", "angular_velocity", "action_rate"}
+    care = {"action_rate", "joint_limits", "self_contact", "table_contact"}
+    assert paid["pour"] == {"poured", "spilled"} | care
+    assert paid["tracking"] == {"position", "rotation", "linear_velocity", "angular_velocity"} | care
     assert paid["dense"] == paid["tracking"] | paid["pour"]
 
 
@@ -60,18 +73,53 @@ def test_senseless_configurations_are_refused(values: dict[str, float]) -> None:
         RewardConfig(**values)
 
 
-def test_draws_stay_in_range_repeat_with_their_seed_and_cost_the_same_numbers() -> None:
-    import numpy as np
+@given(numbers, st.floats(0.01, 100.0))
+def test_the_tolerance_widens_every_tracking_kernel_alike(error: float, tolerance: float) -> None:
+    wide = with_tolerance(RewardConfig(), tolerance)
+    for name in ("position_scale_m", "rotation_scale_rad", "linear_velocity_scale_m_s", "angular_velocity_scale_rad_s"):
+        scale = getattr(RewardConfig(), name)
+        assert kernel(error * tolerance, getattr(wide, name)) == pytest.approx(kernel(error, scale), abs=1e-12)
+    assert with_tolerance(RewardConfig(), 1.0) == RewardConfig()
 
-    spread = Randomization(start_offset_m=(0.02, 0.0, 0.0), receptacle_offset_m=(0.03, 0.03, 0.0))
-    draws = [np.concatenate(spread.draw(np.random.default_rng(seed))) for seed in range(200)]
-    assert np.all(np.abs(draws) <= [0.02, 0, 0, 0.03, 0.03, 0])
-    assert np.ptp(draws, axis=0)[0] > 0.03
-    np.testing.assert_array_equal(draws[3], np.concatenate(spread.draw(np.random.default_rng(3))))
+
+def test_a_joint_near_its_limit_is_charged_linearly() -> None:
+    low, high = -np.ones(7), np.ones(7)
+    assert limit_share(np.zeros(7), low, high) == 0.0
+    for margin_rad, share in ((JOINT_MARGIN_RAD, 0.0), (JOINT_MARGIN_RAD / 2, 0.5), (0.0, 1.0), (-0.2, 1.0)):
+        q_rad = np.zeros(7)
+        q_rad[3] = 1.0 - margin_rad
+        assert limit_share(q_rad, low, high) == pytest.approx(share)
+        assert limit_share(-q_rad, low, high) == pytest.approx(share)
+
+
+def test_draws_stay_in_range_repeat_with_their_seed_and_cost_the_same_numbers() -> None:
+    spread = RANDOMIZATIONS["high"]
+    draws = [spread.draw(np.random.default_rng(seed)) for seed in range(300)]
+    for name in ("start_offset_m", "receptacle_offset_m"):
+        drawn = np.array([getattr(draw, name) for draw in draws])
+        assert np.all(np.abs(drawn) <= getattr(spread, name))
+        assert np.all(np.ptp(drawn, axis=0) >= 1.7 * np.asarray(getattr(spread, name)))
+    for name in ("vessel_mass", "stiffness", "light"):
+        drawn = np.array([getattr(draw, name) for draw in draws])
+        assert np.all(np.abs(drawn - 1.0) <= getattr(spread, name))
+        assert np.ptp(drawn) > 1.7 * getattr(spread, name)
+    assert {draw.receptacle_shape for draw in draws} == set(range(spread.receptacle_shapes))
+    nothing = RANDOMIZATIONS["none"].draw(np.random.default_rng(5))
+    assert nothing.receptacle_shape == -1
+    assert nothing.vessel_mass == nothing.stiffness == nothing.light == 1.0
+    assert not np.any([nothing.start_offset_m, nothing.receptacle_offset_m, nothing.camera_offset_m])
+    again = spread.draw(np.random.default_rng(3)).to_state()
+    assert all(np.array_equal(again[name], value) for name, value in draws[3].to_state().items())
     quiet, loud = np.random.default_rng(0), np.random.default_rng(0)
     RANDOMIZATIONS["none"].draw(quiet)
     spread.draw(loud)
     assert quiet.uniform() == loud.uniform()
+
+
+@pytest.mark.parametrize("value", [-0.1, 2.0, math.nan, "much", (0.1, 0.1)])
+def test_senseless_factors_are_refused(value: object) -> None:
+    with pytest.raises(UserError, match="vessel_mass"):
+        Randomization(vessel_mass=value)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("value", [(0.1, 0.1), (-0.1, 0.0, 0.0), (9.0, 0.0, 0.0)])

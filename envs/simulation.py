@@ -1,0 +1,220 @@
+"""`Simulation`: one compiled scene and its state. It knows no reference, reward or observation.
+
+It poses arm, vessel and particles, advances one control period, and reads off how the vessel moves and where the
+particles are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from ..extract.errors import UserError
+from ..extract.geometry import Array, make_pose
+from .contacts import RobotContacts
+from .kernels import sort_particles, vessel_twist
+from .liquid import Liquid, SpoutConduit, fill_positions, level_share
+from .panda import ARM_JOINTS, FINGER_JOINTS
+from .reference import Reference
+from .scene import RECEPTACLE_BODY, VESSEL_BODY, Scene, build_scene
+from .vessel_geometry import gripper_half_width_m
+
+# The spout's conduit looks at the particles every so many physics steps.
+CONDUIT_STRIDE = 2
+SETTLE_AT_START_S = 1.5
+_PHYSICS = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+ARM = 7
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Positions and velocities in the engine's order, the vessel's pose (4, 4) and where the particles (N,) were."""
+
+    qpos: Array
+    qvel: Array
+    T_world_vessel: Array
+    where: NDArray[np.uint8]
+
+
+class Simulation:
+    """A reference's scene in motion.
+
+    vessel_m (3,), vessel_R (3, 3), twist (6,) [m/s, rad/s, of the vessel's origin, world axes], particles_m (N, 3),
+    where (N,) and share (3,) [held, poured, spilled; see `kernels.sort_particles`] tell the state after the last
+    `refresh()`; the first two and the particles are views into the engine's memory. receptacle_m, receptacle_R: pose
+    of the receptacle, which is still.
+    """
+
+    def __init__(
+        self,
+        reference: Reference,
+        num_particles: int,
+        liquid: Liquid,
+        timestep_s: float,
+        substeps: int,
+        *,
+        actuation: Literal["servo", "torque"] = "servo",
+    ) -> None:
+        self.scene: Scene = build_scene(reference, num_particles, liquid, timestep_s, actuation=actuation)
+        self.model: mujoco.MjModel = self.scene.model
+        self.data = mujoco.MjData(self.model)
+        self.substeps, self._servo = substeps, actuation == "servo"
+        self._bind(reference)
+        self._settled_m = self._settle(reference.q_start_rad)
+
+    # ------------------------------------------------------------------ motion
+
+    def begin(self, q_rad: Array, receptacle_m: Array) -> None:
+        """Rest in a posture (7,), the particles settled in the vessel, the receptacle at `receptacle_m` (3,)."""
+        self.place_receptacle(receptacle_m)
+        self._pose_arm(q_rad)
+        self.particles_m[:] = self._settled_m @ self.vessel_R.T + self.vessel_m
+        self.refresh()
+
+    def place_receptacle(self, position_m: Array) -> None:
+        """Move the receptacle's origin to (3,)."""
+        self.receptacle_m[:] = self.model.body_pos[self._receptacle_id] = position_m
+
+    def advance(self, commands: Iterable[Array]) -> None:
+        """One physics step for each of the commands (7,) to the arm."""
+        data, model, control, step, conduit = self.data, self.model, self.data.ctrl, mujoco.mj_step, self._conduit
+        if conduit is None:
+            for command in commands:
+                control[:ARM] = command
+                step(model, data)
+            return
+        for i, command in enumerate(commands):
+            control[:ARM] = command
+            step(model, data)
+            if i % CONDUIT_STRIDE == 0 and conduit.may_flow(self.T_world_vessel, self.particles_m):
+                self._read_twist()
+                conduit.move(self.particles_m, self.particle_velocities_m_s, self.T_world_vessel, self.twist)
+
+    def refresh(self) -> None:
+        """Bring all that is derived up to the state; after a restored state it is what it was before."""
+        mujoco.mj_kinematics(self.model, self.data)
+        self._read_twist()
+        sort_particles(
+            self.particles_m,
+            self._vessel_hollow,
+            self.vessel_m,
+            self.vessel_R,
+            self._receptacle_hollow,
+            self.receptacle_m,
+            self.receptacle_R,
+            self.where,
+            self.share,
+        )
+
+    def contacts(self) -> tuple[int, int]:
+        """Counts of contacts of the arm with itself, and of arm or held vessel with the table or the floor."""
+        return self._robot_contacts.count(self.data)
+
+    @property
+    def T_world_vessel(self) -> Array:
+        """(4, 4) pose of the held vessel."""
+        return make_pose(self.vessel_R, self.vessel_m)
+
+    @property
+    def T_world_receptacle(self) -> Array:
+        """(4, 4) pose of the receptacle."""
+        return make_pose(self.receptacle_R, self.receptacle_m)
+
+    @property
+    def is_finite(self) -> bool:
+        """Whether the physics still makes sense."""
+        return bool(np.isfinite(self.data.qpos).all() and np.isfinite(self.data.qvel).all())
+
+    @property
+    def settled_held(self) -> int:
+        """How many particles stay in the vessel in the start pose."""
+        return int(np.count_nonzero(self.scene.vessel_cavity.contains(self._settled_m)))
+
+    # ------------------------------------------------------------------ state
+
+    def get_state(self) -> dict[str, Array]:
+        """All that the motion depends on, as copies."""
+        physics = np.empty(mujoco.mj_stateSize(self.model, _PHYSICS))
+        mujoco.mj_getState(self.model, self.data, physics, _PHYSICS)
+        return {"physics": physics, "receptacle_m": self.receptacle_m.copy()}
+
+    def set_state(self, state: Mapping[str, Any]) -> None:
+        """Continue from `get_state()` of this or an equal simulation. Raises UserError for one of another kind."""
+        physics, size = np.asarray(state["physics"], np.float64), mujoco.mj_stateSize(self.model, _PHYSICS)
+        if physics.shape != (size,):
+            raise UserError(
+                f"the state holds {physics.size} physics values, this environment has {size}; "
+                "it was taken with other arguments"
+            )
+        self.place_receptacle(np.asarray(state["receptacle_m"], np.float64))
+        mujoco.mj_resetData(self.model, self.data)
+        mujoco.mj_setState(self.model, self.data, physics, _PHYSICS)
+        self.refresh()
+
+    def get_motion(self) -> Motion:
+        """Positions and velocities alone, from which `set_motion` continues elsewhere in the world."""
+        return Motion(self.data.qpos.copy(), self.data.qvel.copy(), self.T_world_vessel, self.where.copy())
+
+    def set_motion(self, motion: Motion, q_rad: Array) -> None:
+        """Take over a motion with the arm at `q_rad` (7,); the particles stay where they are in the world."""
+        self._pose_arm(q_rad)
+        self.data.qpos[ARM:], self.data.qvel[:] = motion.qpos[ARM:], motion.qvel
+        mujoco.mj_kinematics(self.model, self.data)
+
+    # ------------------------------------------------------------------ inside
+
+    def _bind(self, reference: Reference) -> None:
+        model, data, scene = self.model, self.data, self.scene
+        arm = [int(model.joint(name).qposadr[0]) for name in (*ARM_JOINTS, *FINGER_JOINTS)]
+        if arm != list(range(9)) or model.nq != 9 + 3 * scene.num_particles:
+            raise RuntimeError("the scene's joints are not in the order arm, fingers, particles")
+        vessel_id, self._receptacle_id = int(model.body(VESSEL_BODY).id), int(model.body(RECEPTACLE_BODY).id)
+        # Views into the engine's memory: always the pose of the last kinematics.
+        self.vessel_m, self.vessel_R = data.xpos[vessel_id], data.xmat[vessel_id].reshape(3, 3)
+        self._axes, self._anchors_m, self._rates = data.xaxis[:ARM], data.xanchor[:ARM], data.qvel[:ARM]
+        self.particles_m = data.qpos[9:].reshape(-1, 3)
+        self.particle_velocities_m_s = data.qvel[9:].reshape(-1, 3)
+        self.twist: Array = np.zeros(6)
+        self._robot_contacts = RobotContacts(model)
+        self.where: NDArray[np.uint8] = np.zeros(scene.num_particles, np.uint8)
+        self.share: Array = np.zeros(3)
+        self.receptacle_m: Array = scene.T_world_receptacle[:3, 3].copy()
+        self.receptacle_R: Array = scene.T_world_receptacle[:3, :3].copy()
+        self._vessel_hollow, self._receptacle_hollow = scene.vessel_cavity.arrays, scene.receptacle_cavity.arrays
+        self._gripper_m = gripper_half_width_m(scene.vessel, reference.T_hand_object)
+        self._conduit = self._make_conduit() if scene.vessel.outlet.kind == "spout" and scene.num_particles else None
+
+    def _make_conduit(self) -> SpoutConduit:
+        scene = self.scene
+        share = level_share(scene.liquid, scene.vessel_cavity, scene.num_particles, scene.radius_m)
+        return SpoutConduit(scene.vessel, scene.vessel_cavity, scene.vessel_boxes, scene.radius_m, share)
+
+    def _settle(self, q_rad: Array) -> Array:
+        """(N, 3) resting places of the particles in the vessel's frame."""
+        scene = self.scene
+        lattice = fill_positions(
+            scene.vessel_cavity, scene.vessel_boxes, scene.num_particles, scene.radius_m, scene.vessel.category
+        )
+        self._pose_arm(q_rad)
+        self.particles_m[:] = lattice @ self.vessel_R.T + self.vessel_m
+        if scene.num_particles:
+            mujoco.mj_step(self.model, self.data, round(SETTLE_AT_START_S / self.model.opt.timestep))
+            mujoco.mj_kinematics(self.model, self.data)
+        return np.asarray((self.particles_m - self.vessel_m) @ self.vessel_R)
+
+    def _pose_arm(self, q_rad: Array) -> None:
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.qpos[:ARM] = q_rad
+        self.data.qpos[ARM : ARM + 2] = self.data.ctrl[ARM : ARM + 2] = self._gripper_m
+        if self._servo:
+            self.data.ctrl[:ARM] = q_rad
+        mujoco.mj_kinematics(self.model, self.data)
+
+    def _read_twist(self) -> None:
+        # Seven joints move the vessel; the engine's own velocities would first go through every particle.
+        vessel_twist(self._axes, self._anchors_m, self._rates, self.vessel_m, self.twist)

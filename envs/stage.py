@@ -1,0 +1,59 @@
+"""`Stage`: one geometry ready to play on: a reference, its simulation, its cameras, and what an episode drew for it."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+
+from ..extract.geometry import Array
+from .liquid import Liquid
+from .observations import Targets
+from .randomization import Draw, ModelVariation
+from .reference import Reference
+from .rendering import Cameras
+from .simulation import Simulation
+from .start import Rehearsal
+
+
+class Stage:
+    """reference: this episode's; base: as it was given; targets: the reference's, for comparison with the object."""
+
+    def __init__(
+        self,
+        reference: Reference,
+        num_particles: int,
+        liquid: Liquid,
+        timestep_s: float,
+        substeps: int,
+        actuation: Literal["servo", "torque"],
+    ) -> None:
+        self.base = self.reference = reference
+        self._arguments = (reference, num_particles, liquid, timestep_s, substeps)
+        self.simulation = Simulation(*self._arguments, actuation=actuation)
+        self.pictures = Cameras(self.simulation.model)
+        self._variation = ModelVariation(self.simulation.model)
+        self.targets = self._base_targets = Targets.of(reference)
+
+    def take(self, draw: Draw) -> None:
+        """Make model and reference those of an episode; the simulation's state is left as it is."""
+        self._variation.apply(draw)
+        self.reference = self.base.warped(tuple(draw.start_offset_m), tuple(draw.receptacle_offset_m))
+        moved = self.reference is not self.base
+        self.targets = self._base_targets.shifted(self.reference) if moved else self._base_targets
+
+    def begin(self, draw: Draw, index: int) -> tuple[Array, Array]:
+        """Begin an episode at a knot of the reference; joint targets (7,) in rad and their velocity (7,) in rad/s."""
+        self.take(draw)
+        if index == 0:
+            q_rad = self.reference.q_start_rad
+            self.simulation.begin(q_rad, self.reference.T_world_receptacle[:3, 3])
+            return q_rad, np.zeros(7)
+        q_rad = self.rehearsal.begin(self.simulation, self.reference, index)
+        return q_rad, (self.rehearsal.q_rad[index] - self.rehearsal.q_rad[index - 1]) * self.base.control_hz
+
+    @cached_property
+    def rehearsal(self) -> Rehearsal:
+        """The states along the reference; played through when first asked for."""
+        return Rehearsal(self.base, Simulation(*self._arguments))
