@@ -1,6 +1,6 @@
 """Compiled loops of `FastLiquid`: neighbours, contacts with moving walls, and the projection of both.
 
-Shapes are rows of 16 numbers: centre (3), rotation (9, row by row), half extents (3), 1 for a cylinder about its z. They
+Shapes are rows of 16 numbers: centre (3), rotation (9, row by row), half extents (3), 1 for a cylinder about z. They
 come in groups that move as one: the held vessel, the receptacle, what stands still. Every loop runs in a fixed order
 and nothing is summed in parallel, so equal input gives equal bits.
 """
@@ -19,8 +19,9 @@ from ..extract.geometry import Array
 Ints = NDArray[np.int32]
 
 GRAVITY_M_S2 = 9.81
-# Pairs nearer than so many radii are watched through a step: touching, or 2.5 to 5 mm apart.
-PAIR_REACH_RADII = 3.0
+# Pairs that will be nearer than so many radii in the middle of a step are watched through it: faster ones are noticed
+# when they overlap a little.
+PAIR_REACH_RADII = 2.5
 # Contacts are kept ready for what neighbours may push into a wall within a step.
 SLACK_RADII = 0.2
 # A sphere counts as arrived when it is so near to a wall; and so many strides are made on the way to it.
@@ -32,16 +33,16 @@ CONTACT_WIDTH = 11
 
 
 @njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def nearest(shape: Array, x: float, y: float, z: float) -> tuple[float, float, float, float]:
-    """Signed distance of a point from a shape's surface and the unit vector (3 numbers) that leads away from it."""
-    dx, dy, dz = x - shape[0], y - shape[1], z - shape[2]
-    a = shape[3] * dx + shape[6] * dy + shape[9] * dz
-    b = shape[4] * dx + shape[7] * dy + shape[10] * dz
-    c = shape[5] * dx + shape[8] * dy + shape[11] * dz
-    beyond_c = abs(c) - shape[14]
-    if shape[15] > 0.0:
+def nearest(shapes: Array, k: int, x: float, y: float, z: float) -> tuple[float, float, float, float]:
+    """Signed distance of a point from shape `k`'s surface and the unit vector (3 numbers) that leads away from it."""
+    dx, dy, dz = x - shapes[k, 0], y - shapes[k, 1], z - shapes[k, 2]
+    a = shapes[k, 3] * dx + shapes[k, 6] * dy + shapes[k, 9] * dz
+    b = shapes[k, 4] * dx + shapes[k, 7] * dy + shapes[k, 10] * dz
+    c = shapes[k, 5] * dx + shapes[k, 8] * dy + shapes[k, 11] * dz
+    beyond_c = abs(c) - shapes[k, 14]
+    if shapes[k, 15] > 0.0:
         rho = max(math.sqrt(a * a + b * b), 1e-12)
-        beyond = rho - shape[12]
+        beyond = rho - shapes[k, 12]
         if beyond <= 0.0 and beyond_c <= 0.0:
             across, up = (1.0, 0.0) if beyond > beyond_c else (0.0, 1.0)
             distance = max(beyond, beyond_c)
@@ -51,7 +52,7 @@ def nearest(shape: Array, x: float, y: float, z: float) -> tuple[float, float, f
             across, up = across / distance, up / distance
         a, b, c = across * a / rho, across * b / rho, math.copysign(up, c)
     else:
-        beyond_a, beyond_b = abs(a) - shape[12], abs(b) - shape[13]
+        beyond_a, beyond_b = abs(a) - shapes[k, 12], abs(b) - shapes[k, 13]
         distance = max(beyond_a, beyond_b, beyond_c)
         if distance <= 0.0:
             a = math.copysign(1.0, a) if beyond_a == distance else 0.0
@@ -65,22 +66,22 @@ def nearest(shape: Array, x: float, y: float, z: float) -> tuple[float, float, f
             a, b, c = a / distance, b / distance, c / distance
     return (
         distance,
-        shape[3] * a + shape[4] * b + shape[5] * c,
-        shape[6] * a + shape[7] * b + shape[8] * c,
-        shape[9] * a + shape[10] * b + shape[11] * c,
+        shapes[k, 3] * a + shapes[k, 4] * b + shapes[k, 5] * c,
+        shapes[k, 6] * a + shapes[k, 7] * b + shapes[k, 8] * c,
+        shapes[k, 9] * a + shapes[k, 10] * b + shapes[k, 11] * c,
     )
 
 
 @njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def within(shape: Array, x: float, y: float, z: float, reach_m: float) -> bool:
-    """Whether a point may lie within `reach_m` of a shape: cheaper than `nearest`, generous at edges and corners."""
-    dx, dy, dz = x - shape[0], y - shape[1], z - shape[2]
-    if abs(shape[5] * dx + shape[8] * dy + shape[11] * dz) > shape[14] + reach_m:
+def within(shapes: Array, k: int, x: float, y: float, z: float, reach_m: float) -> bool:
+    """Whether a point may lie within `reach_m` of shape `k`: cheaper than `nearest`, generous at edges and corners."""
+    dx, dy, dz = x - shapes[k, 0], y - shapes[k, 1], z - shapes[k, 2]
+    if abs(shapes[k, 5] * dx + shapes[k, 8] * dy + shapes[k, 11] * dz) > shapes[k, 14] + reach_m:
         return False
-    if abs(shape[3] * dx + shape[6] * dy + shape[9] * dz) > shape[12] + reach_m:
+    if abs(shapes[k, 3] * dx + shapes[k, 6] * dy + shapes[k, 9] * dz) > shapes[k, 12] + reach_m:
         return False
-    second = shape[12] if shape[15] > 0.0 else shape[13]
-    return abs(shape[4] * dx + shape[7] * dy + shape[10] * dz) <= second + reach_m
+    second = shapes[k, 12] if shapes[k, 15] > 0.0 else shapes[k, 13]
+    return abs(shapes[k, 4] * dx + shapes[k, 7] * dy + shapes[k, 10] * dz) <= second + reach_m
 
 
 @njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
@@ -96,20 +97,21 @@ def shapes_by_cell(shapes: Array, low: Array, cell_m: float, size: Ints, reach_m
             items = np.zeros(starts[-1], np.int32)
             taken = starts.copy()
         for number in range(len(shapes)):
-            shape = shapes[number]
             first, last = np.zeros(3, np.int32), np.zeros(3, np.int32)
             for axis in range(3):
-                row = shape[3 + 3 * axis : 6 + 3 * axis]
+                row = shapes[number, 3 + 3 * axis : 6 + 3 * axis]
                 # A cylinder's second half extent is unused; its first bounds it along both.
-                second = shape[12] if shape[15] > 0.0 else shape[13]
-                half = abs(row[0]) * shape[12] + abs(row[1]) * second + abs(row[2]) * shape[14] + reach_m
-                first[axis] = max(0, int(math.floor((shape[axis] - half - low[axis]) / cell_m)))
-                last[axis] = min(size[axis] - 1, int(math.floor((shape[axis] + half - low[axis]) / cell_m)))
+                second = shapes[number, 12] if shapes[number, 15] > 0.0 else shapes[number, 13]
+                half = (
+                    abs(row[0]) * shapes[number, 12] + abs(row[1]) * second + abs(row[2]) * shapes[number, 14] + reach_m
+                )
+                first[axis] = max(0, math.floor((shapes[number, axis] - half - low[axis]) / cell_m))
+                last[axis] = min(size[axis] - 1, math.floor((shapes[number, axis] + half - low[axis]) / cell_m))
             for i in range(first[0], last[0] + 1):
                 for j in range(first[1], last[1] + 1):
                     for k in range(first[2], last[2] + 1):
                         x, y, z = low[0] + (i + 0.5) * cell_m, low[1] + (j + 0.5) * cell_m, low[2] + (k + 0.5) * cell_m
-                        if nearest(shape, x, y, z)[0] > far:
+                        if nearest(shapes, number, x, y, z)[0] > far:
                             continue
                         cell = (i * size[1] + j) * size[2] + k
                         if filling:
@@ -131,7 +133,7 @@ def find_pairs(x: Array, radius_m: float, pairs: Ints, cells: Ints, starts: Ints
     starts[:] = 0
     for i in range(len(x)):
         for axis in range(3):
-            cells[i, axis] = int(math.floor(x[i, axis] / reach))
+            cells[i, axis] = math.floor(x[i, axis] / reach)
         cells[i, 3] = _bucket(cells[i, 0], cells[i, 1], cells[i, 2], mask)
         starts[cells[i, 3] + 1] += 1
     for bucket in range(len(starts) - 1):
@@ -191,9 +193,10 @@ def find_contacts(
     room = len(which)
     slack, arrived = SLACK_RADII * radius_m, ARRIVED_RADII * radius_m
     fall = 0.5 * GRAVITY_M_S2 * timestep_s * timestep_s
-    for i in range(len(x)):
-        for g in range(len(groups)):
-            before, after = poses[g, 0], poses[g, 1]
+    for g in range(len(groups)):
+        before, after = poses[g, 0], poses[g, 1]
+        cell_m, reach_m = lows[g, 3], lows[g, 4]
+        for i in range(len(x)):
             ax, ay, az = _inside(before, x[i, 0], x[i, 1], x[i, 2])
             bx, by, bz = _inside(
                 after,
@@ -203,29 +206,29 @@ def find_contacts(
             )
             bx, by, bz = bx - ax, by - ay, bz - az
             way = math.sqrt(bx * bx + by * by + bz * bz)
-            first, last, cell_m, reach_m = groups[g, 0], groups[g, 1], lows[g, 3], lows[g, 4]
+            first, last = groups[g, 0], groups[g, 1]
             # Looked up in the middle of the way, from where half of it reaches everything.
             listed = 0.5 * way < reach_m - slack
             if listed:
-                cx = int(math.floor((ax + 0.5 * bx - lows[g, 0]) / cell_m))
-                cy = int(math.floor((ay + 0.5 * by - lows[g, 1]) / cell_m))
-                cz = int(math.floor((az + 0.5 * bz - lows[g, 2]) / cell_m))
+                cx = math.floor((ax + 0.5 * bx - lows[g, 0]) / cell_m)
+                cy = math.floor((ay + 0.5 * by - lows[g, 1]) / cell_m)
+                cz = math.floor((az + 0.5 * bz - lows[g, 2]) / cell_m)
                 if not (0 <= cx < groups[g, 3] and 0 <= cy < groups[g, 4] and 0 <= cz < groups[g, 5]):
                     continue
                 cell = groups[g, 2] + (cx * groups[g, 4] + cy) * groups[g, 5] + cz
                 first, last = starts[cell], starts[cell + 1]
             for place in range(first, last):
-                shape = shapes[items[place]] if listed else shapes[place]
-                if not within(shape, ax, ay, az, radius_m + way + slack):
+                k = items[place] if listed else place
+                if not within(shapes, k, ax, ay, az, radius_m + way + slack):
                     continue
-                distance, nx, ny, nz = nearest(shape, ax, ay, az)
+                distance, nx, ny, nz = nearest(shapes, k, ax, ay, az)
                 gap = distance - radius_m
                 t = 0.0
                 for _ in range(MAX_STRIDES):
                     if gap <= arrived or t >= 1.0:
                         break
                     t = min(1.0, t + gap / way)
-                    distance, nx, ny, nz = nearest(shape, ax + t * bx, ay + t * by, az + t * bz)
+                    distance, nx, ny, nz = nearest(shapes, k, ax + t * bx, ay + t * by, az + t * bz)
                     gap = distance - radius_m
                 if gap > slack or found == room:
                     continue
@@ -394,7 +397,10 @@ def advance(
 ) -> None:
     """One step in small substeps, each with one sweep over all constraints (Macklin et al. 2019)."""
     radius_m, timestep_s, friction, drag_1_s, substeps = numbers
-    pair_count = find_pairs(x, radius_m, pairs, grid[0], grid[1], grid[2])
+    for i in range(len(x)):
+        for axis in range(3):
+            last[i, axis] = x[i, axis] + 0.5 * timestep_s * v[i, axis]
+    pair_count = find_pairs(last, radius_m, pairs, grid[0], grid[1], grid[2])
     contact_count = find_contacts(
         x, v, radius_m, timestep_s, shapes, groups, lows, starts, items, poses, which, contacts
     )
