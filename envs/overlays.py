@@ -65,20 +65,19 @@ class Overlay:
 class Overlays:
     """The overlays that were asked for, with the memory that the trail needs."""
 
-    def __init__(self, names: Sequence[str], lip_m: Array, control_hz: float) -> None:
-        """lip_m: (3,) the outlet in the vessel's frame. Raises UserError for names that are not in `OVERLAYS`."""
+    def __init__(self, names: Sequence[str], control_hz: float) -> None:
+        """Raises UserError for names that are not in `OVERLAYS`."""
         self.names = overlay_names(names)
-        self._lip_m = np.asarray(lip_m, float)
         self._trail: deque[Array] = deque(maxlen=round(TRAIL_S * control_hz) + 1)
 
     def restart(self) -> None:
         """Forget the trail: a new episode, or a restored state, begins."""
         self._trail.clear()
 
-    def record(self, T_world_object: Array) -> None:
-        """Remember where the lip is; called at reset and after every step."""
+    def record(self, lip_m: Array) -> None:
+        """Remember where the lip (3,) is in the world; called when an episode begins and after every step."""
         if "trail" in self.names:
-            self._trail.append(T_world_object[:3, :3] @ self._lip_m + T_world_object[:3, 3])
+            self._trail.append(np.array(lip_m, float))
 
     def at(self, T_world_reference: Array, hud: Hud) -> Overlay | None:
         """What to draw now, with the reference's pose (4, 4) and the figures of this moment; None for nothing."""

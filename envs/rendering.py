@@ -33,7 +33,7 @@ class Cameras:
     """
 
     def __init__(self, model: mujoco.MjModel) -> None:
-        self._model = model
+        self.model = model
         self._surfaces: dict[tuple[int, int], _Surface] = {}
 
     def picture(
@@ -50,8 +50,8 @@ class Cameras:
         """
         surface = self._surfaces.get(size)
         if surface is None:
-            surface = self._surfaces[size] = _Surface(self._model, size)
-        picture = surface.draw(data, self._model.camera(camera).id, particles, overlay)
+            surface = self._surfaces[size] = _Surface(self.model, size)
+        picture = surface.draw(data, self.model.camera(camera).id, particles, overlay)
         if overlay is not None and overlay.hud is not None:
             write_hud(picture, overlay.hud)
         return picture
@@ -166,7 +166,7 @@ class Viewer:
     """
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, fps: float) -> None:
-        _require_screen()
+        require_screen()
         import mujoco.viewer
 
         try:
@@ -176,7 +176,7 @@ class Viewer:
                 f"MuJoCo's viewer cannot be opened ({error}); start Python as `mjpython`, or use "
                 "render_mode='rgb_array'"
             ) from error
-        self._model, self._data, self._period_s, self._due_s = model, data, 1.0 / fps, time.monotonic()
+        self._model, self.data, self._period_s, self._due_s = model, data, 1.0 / fps, time.monotonic()
         self._spheres = _Spheres()
 
     @property
@@ -215,7 +215,8 @@ def has_screen() -> bool:
     return platform.system() != "Linux" or any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
 
 
-def _require_screen() -> None:
+def require_screen() -> None:
+    """Raise UserError unless a window can be opened."""
     mend = "set DISPLAY, or use render_mode='rgb_array'"
     if not has_screen():
         raise UserError(f"MuJoCo's viewer needs a screen and there is none here; {mend}")
