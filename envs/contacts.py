@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from .kernels import count_pairs
 from .panda import CONTACT_HELD, CONTACT_ROBOT
 
 # Sums of two kinds tell which pair it is.
@@ -30,6 +31,7 @@ class RobotContacts:
         """Contacts of the arm with itself, and of arm or held vessel with the furniture, as of the last step."""
         if data.ncon == 0:
             return 0, 0
-        pair = self._kinds[data.contact.geom].sum(axis=1)
-        furniture = (pair == _FURNITURE + _ROBOT) | (pair == _FURNITURE + _HELD)
-        return int(np.count_nonzero(pair == 2 * _ROBOT)), int(np.count_nonzero(furniture))
+        itself, furniture = count_pairs(
+            data.contact.geom, self._kinds, 2 * _ROBOT, _FURNITURE + _ROBOT, _FURNITURE + _HELD
+        )
+        return itself, furniture

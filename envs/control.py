@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ..extract.errors import UserError
 from ..extract.geometry import Array
+from .kernels import ramp
 from .kinematics import panda_chain, solve_ik
 from .observations import Entry
 from .panda import ARM_JOINTS, DQ_MAX_RAD_S, Q_MAX_RAD, Q_MIN_RAD, SERVO_LEAD_S, TAU_MAX_NM
@@ -67,8 +68,6 @@ class Control:
         self.space = spaces.Box(low.astype(np.float32), high.astype(np.float32))
         self._low, self._high = low, high
         self._delta_rad = DQ_MAX_RAD_S / control_hz
-        # Commands of a period: the share of the way at the end of each substep, and the servos' lead.
-        self._shares = (np.arange(1, substeps + 1) / substeps)[:, None]
         self._lead = SERVO_LEAD_S * control_hz
         self._commands = np.empty((substeps, 7))
         self.state = ControlState(np.zeros(7), np.zeros(7))
@@ -102,15 +101,11 @@ class Control:
             self.state = ControlState(target, change)
             self._commands[:] = target
             return self._commands, float(change @ change) / 7
-        step = np.minimum(np.maximum(self._wanted(action) - last.target, -self._delta_rad), self._delta_rad)
-        target = np.minimum(np.maximum(last.target + step, Q_MIN_RAD), Q_MAX_RAD)
-        way = target - last.target
-        rate = way * self._hz
-        np.multiply(self._shares, way, out=self._commands)
-        self._commands += last.target + self._lead * way
+        target, rate = last.target.copy(), last.rate.copy()
+        wanted = self._wanted(action)
+        jerk = ramp(target, rate, wanted, self._delta_rad, Q_MIN_RAD, Q_MAX_RAD, self._hz, self._lead, self._commands)
         self.state = ControlState(target, rate)
-        change = (rate - last.rate) / (2 * DQ_MAX_RAD_S)
-        return self._commands, float(change @ change) / 7
+        return self._commands, jerk
 
     def _wanted(self, action: Array) -> Array:
         target = self.state.target

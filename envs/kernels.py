@@ -35,6 +35,52 @@ def vessel_twist(axes: Array, anchors_m: Array, rates_rad_s: Array, point_m: Arr
 
 
 @njit(cache=True)
+def count_pairs(
+    geoms: NDArray[np.int32], kinds: NDArray[np.int64], first: int, second: int, third: int
+) -> tuple[int, int]:
+    """How many pairs of geoms (C, 2) have kinds that add up to `first`, and how many to `second` or `third`."""
+    one, other = 0, 0
+    for c in range(geoms.shape[0]):
+        pair = kinds[geoms[c, 0]] + kinds[geoms[c, 1]]
+        if pair == first:
+            one += 1
+        elif pair in (second, third):
+            other += 1
+    return one, other
+
+
+@njit(cache=True)
+def ramp(
+    target: Array,
+    rate: Array,
+    wanted: Array,
+    step_most: Array,
+    low: Array,
+    high: Array,
+    hz: float,
+    lead: float,
+    out: Array,
+) -> float:
+    """Move joint targets (7,) toward `wanted`, in place, and write the commands (S, 7) that lead there.
+
+    step_most: (7,) how far a joint may go in a period; low, high: (7,) its limits; lead: periods by which a command is
+    ahead of the target. `rate` (7,) becomes the target's velocity. Returns the mean square change of the rate over
+    twice the greatest.
+    """
+    jerk = 0.0
+    for j in range(target.shape[0]):
+        way = min(max(wanted[j] - target[j], -step_most[j]), step_most[j])
+        way = min(max(target[j] + way, low[j]), high[j]) - target[j]
+        for i in range(out.shape[0]):
+            out[i, j] = target[j] + ((i + 1) / out.shape[0] + lead) * way
+        change = (way * hz - rate[j]) / (2.0 * step_most[j] * hz)
+        jerk += change * change / target.shape[0]
+        target[j] += way
+        rate[j] = way * hz
+    return jerk
+
+
+@njit(cache=True)
 def _inside(x: float, y: float, z: float, levels_m: Array, support_m: Array, normals: Array, axis_xy_m: Array) -> bool:
     """Whether a point in a vessel's frame lies in its hollow (see `vessel_geometry.Cavity`)."""
     last = levels_m.shape[0] - 1

@@ -8,19 +8,16 @@ number, the tolerance, widens or narrows all tracking kernels at once: a curricu
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-
-import numpy as np
+from typing import NamedTuple
 
 from ..extract.errors import UserError
-from ..extract.geometry import Array
 
 JOINT_MARGIN_RAD = 0.1
 
 
-@dataclass(frozen=True)
-class StepErrors:
+class StepErrors(NamedTuple):
     """What one control step gave; all terms are functions of this.
 
     position_error_m, linear_velocity_error_m_s: Euclidean; rotation_error_rad: smallest over the object's symmetry;
@@ -176,9 +173,9 @@ def with_tolerance(config: RewardConfig, tolerance: float) -> RewardConfig:
     return replace(config, **scales)
 
 
-def limit_share(q_rad: Array, low_rad: Array, high_rad: Array) -> float:
+def limit_share(q_rad: Sequence[float], low_rad: Sequence[float], high_rad: Sequence[float]) -> float:
     """0 while every joint of q (7,) keeps `JOINT_MARGIN_RAD` from its limits, rising linearly to 1 at a limit."""
-    margin_rad = float(np.minimum(q_rad - low_rad, high_rad - q_rad).min())
+    margin_rad = min(min(q - low, high - q) for q, low, high in zip(q_rad, low_rad, high_rad, strict=True))
     return min(max(1.0 - margin_rad / JOINT_MARGIN_RAD, 0.0), 1.0)
 
 

@@ -6,7 +6,7 @@ particles are.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ..extract.errors import UserError
 from ..extract.geometry import Array, make_pose
+from .cameras import CameraPose
 from .contacts import RobotContacts
 from .kernels import sort_particles, vessel_twist
 from .liquid import Liquid, SpoutConduit, fill_positions, level_share
@@ -47,7 +48,7 @@ class Simulation:
     vessel_m (3,), vessel_R (3, 3), twist (6,) [m/s, rad/s, of the vessel's origin, world axes], particles_m (N, 3),
     where (N,) and share (3,) [held, poured, spilled; see `kernels.sort_particles`] tell the state after the last
     `refresh()`; the first two and the particles are views into the engine's memory. receptacle_m, receptacle_R: pose
-    of the receptacle, which is still.
+    of the receptacle, which is still. settled_held: how many particles stay in the vessel in the start pose.
     """
 
     def __init__(
@@ -59,13 +60,18 @@ class Simulation:
         substeps: int,
         *,
         actuation: Literal["servo", "torque"] = "servo",
+        cameras: Sequence[CameraPose] = (),
     ) -> None:
-        self.scene: Scene = build_scene(reference, num_particles, liquid, timestep_s, actuation=actuation)
+        self.scene: Scene = build_scene(
+            reference, num_particles, liquid, timestep_s, actuation=actuation, cameras=cameras
+        )
         self.model: mujoco.MjModel = self.scene.model
         self.data = mujoco.MjData(self.model)
         self.substeps, self._servo = substeps, actuation == "servo"
         self._bind(reference)
         self._settled_m = self._settle(reference.q_start_rad)
+        self.settled_held = int(np.count_nonzero(self.scene.vessel_cavity.contains(self._settled_m)))
+        self._before = np.empty(mujoco.mj_stateSize(self.model, _PHYSICS))
 
     # ------------------------------------------------------------------ motion
 
@@ -129,11 +135,6 @@ class Simulation:
     def is_finite(self) -> bool:
         """Whether the physics still makes sense."""
         return bool(np.isfinite(self.data.qpos).all() and np.isfinite(self.data.qvel).all())
-
-    @property
-    def settled_held(self) -> int:
-        """How many particles stay in the vessel in the start pose."""
-        return int(np.count_nonzero(self.scene.vessel_cavity.contains(self._settled_m)))
 
     # ------------------------------------------------------------------ state
 
