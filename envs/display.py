@@ -11,9 +11,14 @@ from numpy.typing import NDArray
 from ..extract.errors import UserError
 from ..extract.geometry import Array
 from .overlays import Hud, Overlays
-from .rendering import Cameras, Particles, Viewer, require_screen
+from .rendering import Cameras, Particles, Viewer, has_screen, require_screen
 
 RENDER_MODES = ("human", "rgb_array")
+
+
+def render_modes() -> list[str]:
+    """The render modes that can work here: there is no window without a screen."""
+    return [mode for mode in RENDER_MODES if mode != "human" or has_screen()]
 
 
 class Display:
@@ -52,6 +57,11 @@ class Display:
     def restart(self) -> None:
         """A new episode, or a restored state, begins."""
         self._overlays.restart()
+
+    @property
+    def has_trail(self) -> bool:
+        """Whether the lip's places are wanted."""
+        return "trail" in self._overlays.names
 
     def record(self, lip_m: Array) -> None:
         """Remember where the lip (3,) is in the world; called when an episode begins and after every step."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..extract.errors import UserError
 from ..extract.geometry import Array
-from .cameras import CAMERAS
+from .cameras import CAMERAS, CameraPose, chosen_cameras
 from .observations import resampled
 from .reference import Reference
 from .scene import MAX_PICTURE_PX
@@ -149,12 +149,10 @@ def picture_size(name: str, size: Sequence[int]) -> tuple[int, int]:
     return int(size[0]), int(size[1])
 
 
-def check_cameras(cameras: Sequence[str], render_camera: str, render_mode: str | None) -> tuple[str, ...]:
-    """Known and different camera names, and a render mode that exists."""
-    if isinstance(cameras, str) or len(set(cameras)) != len(cameras) or len(cameras) == 0:
-        raise UserError(f"cameras is {cameras!r}; give a tuple of different names out of {', '.join(CAMERAS)}")
-    for camera in (*cameras, render_camera):
-        one_of("camera", camera, CAMERAS)
-    if render_mode is not None:
-        one_of("render_mode", render_mode, ("rgb_array",))
-    return tuple(cameras)
+def check_cameras(
+    cameras: Sequence[str | CameraPose | Mapping[str, Any]], render_camera: str
+) -> tuple[tuple[str, ...], tuple[CameraPose, ...]]:
+    """Names of the cameras, those among them that are one's own, and a camera to render with that is there."""
+    names, own = chosen_cameras(cameras)
+    one_of("render_camera", render_camera, tuple(dict.fromkeys((*CAMERAS, *names))))
+    return names, own

@@ -18,7 +18,9 @@ from numpy.typing import NDArray
 from ..extract.errors import UserError
 from ..extract.geometry import Array
 from . import observations
+from .cameras import CameraPose
 from .control import CONTROL_MODES, Control, ControlState
+from .display import Display, render_modes
 from .diverged import PhysicsError, diverged_message
 from .kernels import HELD, POURED, SPILLED
 from .liquid import Liquid
@@ -35,6 +37,7 @@ from .options import (
     preset,
     timing,
 )
+from .overlays import Hud
 from .panda import Q_MAX_RAD, Q_MIN_RAD
 from .randomization import RANDOMIZATIONS, Draw, Randomization
 from .reference import Reference
@@ -57,6 +60,7 @@ if TYPE_CHECKING:
     from ..extract.vessels import Vessel
 
 # Following the reference means to stay this near to it to the end.
+_Q_MIN_RAD, _Q_MAX_RAD = Q_MIN_RAD.tolist(), Q_MAX_RAD.tolist()
 TRACKED_M, TRACKED_RAD = 0.05, 0.3
 _OPTIONS = ("state", "start_offset_m", "receptacle_offset_m", "start_index")
 _STATE = (
@@ -86,7 +90,7 @@ class PandaPourEnv(gym.Env[Observation, NDArray[np.float32]]):
     control_hz: actions per second; a reference at another rate is resampled.
     timestep_s: physics step; must divide the control period; None takes the longest one up to 2 ms that does.
     obs_mode: "state" (agent_pos, environment_state), "pixels" (agent_pos, pixels) or "both".
-    cameras: any of front, wrist, side; image_size: (height, width) in px.
+    cameras: any of front, wrist, side, and `CameraPose`s of one's own; image_size: (height, width) in px.
     control_mode: joint_position, joint_delta, ee_delta or torque; see `control.action_entries`. Targets are kept
         inside the joint limits and move no faster than the joints' speed limits.
     reward_mode: dense, tracking, pour or sparse, or a `RewardConfig`; tolerance: factor on the width of its tracking
@@ -97,13 +101,14 @@ class PandaPourEnv(gym.Env[Observation, NDArray[np.float32]]):
     settle_s: time after the reference's end in which the last reference pose is held.
     success_poured_fraction, success_spilled_fraction: success means at least and at most so much; without particles,
         to have stayed within 5 cm and 0.3 rad of the reference to its end.
-    render_mode: None or "rgb_array"; render_size: (height, width) in px; render_camera: one of the cameras.
+    render_mode: None, "rgb_array" or "human" (MuJoCo's window); render_size: (height, width) in px; render_camera: one
+        of the cameras. overlays: any of ghost (the reference), trail (of the lip) and hud, in what is rendered.
 
     `reset(options=...)` takes `start_offset_m` and `receptacle_offset_m` (3,) and `start_index` in place of the random
     draw, or `state` from `get_state()`. Raises UserError for every argument that makes no sense.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 25}  # noqa: RUF012 (Gymnasium's own convention)
+    metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 25}  # noqa: RUF012 (Gymnasium's own convention)
 
     def __init__(
         self,
@@ -111,7 +116,7 @@ class PandaPourEnv(gym.Env[Observation, NDArray[np.float32]]):
         num_particles: int = 100,
         control_hz: float = 25.0,
         obs_mode: str = "state",
-        cameras: Sequence[str] = ("front", "wrist"),
+        cameras: Sequence[str | CameraPose | Mapping[str, Any]] = ("front", "wrist"),
         image_size: tuple[int, int] = (224, 224),
         control_mode: str = "joint_position",
         randomization: str | Randomization | Mapping[str, Any] = "none",
@@ -129,6 +134,7 @@ class PandaPourEnv(gym.Env[Observation, NDArray[np.float32]]):
         start: str | ReferenceStart | Mapping[str, Any] = "beginning",
         termination: str | Termination | Mapping[str, Any] = "never",
         tolerance: float = 1.0,
+        overlays: Sequence[str] = (),
     ) -> None:
         one_of("obs_mode", obs_mode, ("state", "pixels", "both"))
         one_of("control_mode", control_mode, CONTROL_MODES)
@@ -136,7 +142,7 @@ class PandaPourEnv(gym.Env[Observation, NDArray[np.float32]]):
         check_number("success_poured_fraction", success_poured_fraction, 0.0, 1.0)
         check_number("success_spilled_fraction", success_spilled_fraction, 0.0, 1.0)
         check_number("tolerance", tolerance, 1e-3, 1e3)
-        self.cameras = check_cameras(cameras, render_camera, render_mode)
+        self.cameras, self._own_cameras = check_cameras(cameras, render_camera)
         self.control_hz = float(control_hz)
         self.timestep_s, self._substeps = timing(self.control_hz, timestep_s)
         self.randomization = preset("randomization", randomization, RANDOMIZATIONS, Randomization)
@@ -145,13 +151,13 @@ class PandaPourEnv(gym.Env[Observation, NDArray[np.float32]]):
         self.termination = preset("termination", termination, TERMINATIONS, Termination)
         self._start = preset("start", start, STARTS, ReferenceStart)
         self.obs_mode, self.control_mode = obs_mode, control_mode
-        self.image_size, self.render_size = (
-            picture_size("image_size", image_size),
-            picture_size("render_size", render_size),
-        )
-        self.render_mode, self.render_camera = render_mode, render_camera
+        self.image_size = picture_size("image_size", image_size)
+        render_size = picture_size("render_size", render_size)
+        self.render_mode = render_mode
+        self._display = Display(render_mode, render_camera, render_size, overlays, self.control_hz)
         self.success_poured_fraction, self.success_spilled_fraction = success_poured_fraction, success_spilled_fraction
-        self.metadata = {**type(self).metadata, "render_fps": int(control_hz) if control_hz % 1 == 0 else control_hz}
+        fps = int(control_hz) if control_hz % 1 == 0 else control_hz
+        self.metadata = {"render_modes": render_modes(), "render_fps": fps}
 
         self._num_particles = particle_count(num_particles)
         self._liquid: Liquid = preset("liquid", {} if liquid is None else liquid, {}, Liquid)
@@ -184,7 +190,7 @@ class PandaPourEnv(gym.Env[Observation, NDArray[np.float32]]):
             raise UserError(f"reset has no option {', '.join(unknown)}; it knows {', '.join(_OPTIONS)}")
         if "state" in options:
             self.set_state(options["state"])
-            return self._observation(), self._info(dict.fromkeys(TERMS, 0.0))
+            return self._first()
         # All is drawn even when overridden, so that an option does not shift the draws of later episodes.
         draw = self.randomization.draw(self.np_random)
         index = self._starts.draw(self.np_random) if self._start is not None else 0
@@ -193,7 +199,7 @@ class PandaPourEnv(gym.Env[Observation, NDArray[np.float32]]):
             index = int(options["start_index"])
             check_number("reset option start_index", index, 0, len(self._base) - 1)
         self._begin(Draw(**{**vars(draw), **changes}), index)
-        return self._observation(), self._info(dict.fromkeys(TERMS, 0.0))
+        return self._first()
 
     def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, Info]:
         """Advance one control period."""
@@ -226,7 +232,7 @@ class PandaPourEnv(gym.Env[Observation, NDArray[np.float32]]):
             self._share[1] - poured,
             self._share[2] - spilled,
             jerk,
-            limit_share(simulation.data.qpos[:7], Q_MIN_RAD, Q_MAX_RAD),
+            limit_share(simulation.data.qpos[:7].tolist(), _Q_MIN_RAD, _Q_MAX_RAD),
             float(self_contact > 0),
             float(table_contact > 0),
             float(self.is_success),
@@ -236,16 +242,20 @@ class PandaPourEnv(gym.Env[Observation, NDArray[np.float32]]):
         truncated = self._step_index >= self._max_episode_steps
         if self._start is not None and (lost or truncated):
             self._starts.record(self._step_index, lost)
+        if self._display.is_window:
+            self.render()
         return self._observation(), sum(terms.values()), lost, truncated, self._info(terms)
 
     def render(self) -> NDArray[np.uint8] | None:
-        """(H, W, 3) uint8 picture of `render_camera`, or None without a render mode."""
-        if self.render_mode is None:
-            return None
-        return self._stage.pictures.picture(self.data, self.render_camera, self.render_size)
+        """(H, W, 3) uint8 picture of `render_camera`; None without a render mode, or when it went to the window."""
+        hud = Hud(self._step_index / self.control_hz, *self._share[1:], *self._tracking_errors[:2])
+        T_world_reference = self.reference.T_world_object[self._reference_index]
+        return self._display.show(self._stage.pictures, self.data, T_world_reference, hud)
 
     def close(self) -> None:
-        """Free the rendering contexts."""
+        """Free the rendering contexts and close the window."""
+        if hasattr(self, "_display"):
+            self._display.close()
         for stage in getattr(self, "_stages", {}).values():
             stage.pictures.close()
 
@@ -280,6 +290,7 @@ class PandaPourEnv(gym.Env[Observation, NDArray[np.float32]]):
         self.tolerance = float(state["tolerance"])
         self._starts.failure_rate = np.array(state["failure_rate"], float)
         self.np_random.bit_generator.state = state["generator"]
+        self._display.restart()
         self._look()
 
     # ------------------------------------------------------------------ what one may look at
@@ -371,6 +382,7 @@ class PandaPourEnv(gym.Env[Observation, NDArray[np.float32]]):
                 self.timestep_s,
                 self._substeps,
                 self._control.actuation,
+                self._own_cameras,
             )
         return self._stages[shape]
 
@@ -380,7 +392,14 @@ class PandaPourEnv(gym.Env[Observation, NDArray[np.float32]]):
         target, rate = self._stage.begin(draw, index)
         self._control.reset(target, rate)
         self._worst_m, self._worst_rad = 0.0, 0.0
+        self._display.restart()
         self._look()
+
+    def _first(self) -> tuple[Observation, Info]:
+        """What `reset` returns."""
+        if self._display.is_window:
+            self.render()
+        return self._observation(), self._info(dict.fromkeys(TERMS, 0.0))
 
     def _look(self) -> None:
         simulation = self.simulation
@@ -389,6 +408,8 @@ class PandaPourEnv(gym.Env[Observation, NDArray[np.float32]]):
         self._tracking_errors = self._stage.targets.errors(
             self._reference_index, simulation.vessel_m, simulation.vessel_R, simulation.twist
         )
+        if self._display.has_trail:
+            self._display.record(simulation.vessel_R @ simulation.scene.vessel.outlet.point_m + simulation.vessel_m)
 
     @property
     def _reference_index(self) -> int:

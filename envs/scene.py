@@ -7,6 +7,7 @@ touches furniture with its hull. Nothing else collides: vessels do not touch eac
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -16,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from ..extract.errors import UserError
 from ..extract.geometry import Array, invert_pose, make_pose, transform_points
-from .cameras import add_cameras
+from .cameras import CameraPose, add_cameras
 from .liquid import Liquid, add_particles
 from .panda import CONTACT_HELD, CONTACT_PARTICLE, CONTACT_ROBOT, CONTACT_VESSEL, panda_spec
 from .vessel_geometry import STANDING_WALL_M, Box, Cavity, cavity_of, collision_boxes, visual_parts
@@ -63,8 +64,9 @@ def build_scene(
     timestep_s: float,
     *,
     actuation: Literal["servo", "torque"] = "servo",
+    cameras: Sequence[CameraPose] = (),
 ) -> Scene:
-    """Build and compile the scene of a reference.
+    """Build and compile the scene of a reference, with `cameras` beside the built-in ones.
 
     Raises UserError when the receptacle would stand in the table.
     """
@@ -100,7 +102,7 @@ def build_scene(
     _add_pedestal(spec, standing, receptacle, T_world_receptacle, vessel_contact)
     particle_contact = {**contact, "contype": CONTACT_PARTICLE, "conaffinity": CONTACT_PARTICLE | CONTACT_VESSEL}
     add_particles(spec, num_particles, radius_m, liquid, particle_contact, WATER_RGBA)
-    add_cameras(spec, reference, vessel, T_world_receptacle)
+    add_cameras(spec, reference, vessel, T_world_receptacle, cameras)
     model = spec.compile()
     return Scene(
         model,

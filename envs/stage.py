@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Literal
 
 import numpy as np
 
 from ..extract.geometry import Array
+from .cameras import CameraPose
 from .liquid import Liquid
 from .observations import Targets
 from .randomization import Draw, ModelVariation
@@ -28,10 +30,11 @@ class Stage:
         timestep_s: float,
         substeps: int,
         actuation: Literal["servo", "torque"],
+        cameras: Sequence[CameraPose],
     ) -> None:
         self.base = self.reference = reference
         self._arguments = (reference, num_particles, liquid, timestep_s, substeps)
-        self.simulation = Simulation(*self._arguments, actuation=actuation)
+        self.simulation = Simulation(*self._arguments, actuation=actuation, cameras=cameras)
         self.pictures = Cameras(self.simulation.model)
         self._variation = ModelVariation(self.simulation.model)
         self.targets = self._base_targets = Targets.of(reference)

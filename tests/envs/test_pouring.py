@@ -330,10 +330,10 @@ def test_a_start_that_spills_is_said_in_info(mug_pour: Reference, actions_of: Ac
     [
         ({"obs_mode": "images"}, "obs_mode is 'images'; choose state, pixels, both"),
         ({"control_mode": "force"}, "control_mode is 'force'"),
-        ({"render_mode": "human"}, "render_mode is 'human'"),
+        ({"render_mode": "ansi"}, "render_mode is 'ansi'"),
         ({"cameras": ("front", "top")}, "camera is 'top'; choose front, wrist, side"),
         ({"cameras": "front"}, "give a tuple"),
-        ({"cameras": ("front", "front")}, "different names"),
+        ({"cameras": ("front", "front")}, "each of them once"),
         ({"num_particles": 501}, "num_particles is 501"),
         ({"num_particles": 2.5}, "num_particles is 2.5"),
         ({"image_size": (4, 4)}, r"image_size is \(4, 4\)"),

@@ -390,3 +390,70 @@ def test_viewer_with_a_screen_that_is_not_there_does_not_hang(
     assert has_screen()
     with pytest.raises(UserError, match=":7391"):
         Viewer(empty.model, empty.data, fps=25)
+
+
+# ---------------------------------------------------------------------- in the environment
+
+
+def test_render_draws_the_overlays_and_the_observations_stay_free_of_them(mug_pour: Reference) -> None:
+    common: dict[str, Any] = {"num_particles": 5, "obs_mode": "both", "image_size": SIZE, "render_size": SIZE}
+    top = CameraPose("top", look_at(np.array([0.5, 0.0, 1.2]), np.array([0.5, 0.01, 0.0]), np.array([0.0, 1.0, 0.0])))
+    pictures, observations = {}, {}
+    for overlays in ((), OVERLAYS):
+        env = PandaPourEnv(
+            mug_pour, **common, cameras=("side", top), render_mode="rgb_array", render_camera="top", overlays=overlays
+        )
+        env.reset(seed=0)
+        for _ in range(3):
+            observation, *_ = env.step(np.asarray(mug_pour.q_start_rad + 0.05, np.float32))
+        pictures[overlays], observations[overlays] = env.render(), observation["pixels"]
+        env.close()
+    assert set(observations[()]) == {"side", "top"}
+    for camera in ("side", "top"):
+        assert np.array_equal(observations[()][camera], observations[OVERLAYS][camera])
+    plain, drawn = pictures[()], pictures[OVERLAYS]
+    assert plain is not None
+    assert drawn is not None
+    assert np.array_equal(plain, observations[()]["top"])
+    assert len(changed(plain, drawn)) > 100
+
+
+def test_window_follows_every_step_and_reset(mug_pour: Reference, monkeypatch: pytest.MonkeyPatch) -> None:
+    import vid2demo.envs.display as display
+    import vid2demo.envs.rendering as rendering
+
+    windows = []
+
+    def open_window(model: mujoco.MjModel, data: mujoco.MjData, **_: Any) -> Window:
+        windows.append(Window(model))
+        return windows[-1]
+
+    for module in (display, rendering):
+        monkeypatch.setattr(module, "require_screen", lambda: None)
+    monkeypatch.setattr(mujoco.viewer, "launch_passive", open_window)
+    env = PandaPourEnv(mug_pour, num_particles=0, control_hz=100.0, render_mode="human", overlays=("ghost", "trail"))
+    env.reset(seed=0)
+    for _ in range(4):
+        env.step(env.action_space.sample())
+    assert env.render() is None
+    (window,) = windows
+    assert window.synced == 6
+    assert window.user_scn.ngeom == 1 + 4
+    env.reset(seed=0)
+    assert window.user_scn.ngeom == 1
+    env.close()
+    assert not window.running
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ({"render_mode": "ansi"}, "render_mode"),
+        ({"render_camera": "top"}, "render_camera"),
+        ({"overlays": ("fog",)}, "overlays"),
+        ({"cameras": ("back",)}, "camera"),
+    ],
+)
+def test_rendering_arguments_are_checked(arguments: dict[str, Any], said: str, mug_pour: Reference) -> None:
+    with pytest.raises(UserError, match=said):
+        PandaPourEnv(mug_pour, num_particles=0, **arguments)
