@@ -242,9 +242,18 @@ def _add_vessel(
         geom = body.add_geom(type=kind, size=size, pos=box.center_m.tolist(), quat=wxyz(box.R), **contact)
         geom.group, geom.mass = 3, 0.0
     body.mass, body.explicitinertial = vessel.mass_kg, True
-    # A box of the vessel's size, its mass spread toward the walls, is near enough for what a wrist feels.
-    x, y, z = vessel.extents_m
-    body.inertia = [vessel.mass_kg / 8 * (a * a + b * b) for a, b in ((y, z), (x, z), (x, y))]
+    body.ipos, body.fullinertia = _shell_inertia(vessel)
+
+
+def _shell_inertia(vessel: Vessel) -> tuple[Array, Array]:
+    """Centre of mass (3,) and inertia about it (xx, yy, zz, xy, xz, yz), of walls that are equally thick all over."""
+    points, share = np.asarray(vessel.mesh.triangles_center), np.asarray(vessel.mesh.area_faces)
+    share = share / share.sum()
+    center = share @ points
+    away = points - center
+    second = vessel.mass_kg * (away * share[:, None]).T @ away
+    full = np.trace(second) * np.eye(3) - second
+    return center, full[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
 
 
 def _add_hull(spec: mujoco.MjSpec, body: mujoco.MjsBody, vessel: Vessel, contact: dict[str, Any]) -> None:
