@@ -104,11 +104,12 @@ def solve_ik(
     rest_gain: float = 0.05,
     damping: float = 0.02,
     margin_rad: float = 0.02,
+    until: float = 0.0,
 ) -> tuple[Array, Array]:
     """Damped least squares from q (M, 7) to hand poses (M, 4, 4), inside the joint limits less `margin_rad`.
 
     The redundancy is spent on drawing near `q_rest_rad` ((7,) or (M, 7); the initial q if None).
-    Returns q (M, 7) and the remaining error (M, 6) [m, rad].
+    It ends early when no error, in m or rad, is above `until`. Returns q (M, 7) and the remaining error (M, 6) [m, rad].
     """
     chain = panda_chain()
     q = np.clip(q_init_rad, Q_MIN_RAD + margin_rad, Q_MAX_RAD - margin_rad)
@@ -117,6 +118,8 @@ def solve_ik(
     for _ in range(iterations):
         frames = chain.frames(q)
         error = pose_error(frames[:, JOINT_COUNT], T_world_hand)
+        if np.abs(error).max() <= until:
+            return q, error
         J = hand_jacobian(frames)
         Jt = J.swapaxes(1, 2)
         pull = rest_gain * (rest - q)
@@ -163,7 +166,13 @@ def configuration_near(T_world_object: Array, T_hand_object: Array, q_near_rad: 
     """
     T_hand = (T_world_object @ invert_pose(T_hand_object))[None]
     q, error = solve_ik(
-        T_hand, np.asarray(q_near_rad, float)[None], iterations=60, rest_gain=0.02, damping=0.005, margin_rad=0.0
+        T_hand,
+        np.asarray(q_near_rad, float)[None],
+        iterations=60,
+        rest_gain=0.0,
+        damping=0.005,
+        margin_rad=0.0,
+        until=1e-9,
     )
     off_m, off_rad = float(np.linalg.norm(error[0, :3])), float(np.linalg.norm(error[0, 3:]))
     if off_m > 1e-3 or off_rad > np.deg2rad(0.5):

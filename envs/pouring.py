@@ -326,6 +326,11 @@ class PandaPourEnv(gym.Env[Observation, NDArray[np.float32]]):
         self._tolerance = float(value)
         self.reward_config = with_tolerance(self._reward_at_one, self._tolerance)
 
+    @property
+    def is_watched(self) -> bool:
+        """Whether there is a window that nobody has closed."""
+        return self._display.is_window and self._display.is_open
+
     def reward_table(self) -> str:
         """The reward's terms, weights and scales in plain text."""
         return term_table(self.reward_config)
@@ -383,6 +388,7 @@ class PandaPourEnv(gym.Env[Observation, NDArray[np.float32]]):
                 self._substeps,
                 self._control.actuation,
                 self._own_cameras,
+                self._stages.get(-1),
             )
         return self._stages[shape]
 

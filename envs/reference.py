@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline, Slerp
 
@@ -174,8 +175,12 @@ class Reference:
             return self
         pour_s = self.time_s[self.pour_index] - self.time_s[0]
         blend = minimum_jerk((self.time_s - self.time_s[0]) / max(pour_s, 1e-9))[:, None]
+        offset_m = (1.0 - blend) * start_m + blend * receptacle_m
         T = np.array(self.T_world_object)
-        T[:, :3, 3] += (1.0 - blend) * start_m + blend * receptacle_m
+        T[:, :3, 3] += offset_m
+        # Central differences are linear in the positions, and nothing turns in another way.
+        twist = np.array(self.twist_world)
+        twist[:, :3] += _central_differences(offset_m, self.time_s)
         header = dict(self.header)
         if self.has_receptacle:
             T_receptacle = self.T_world_receptacle.copy()
@@ -186,7 +191,7 @@ class Reference:
 
             q_rad = configuration_near(T[0], self.T_hand_object, self.q_start_rad)
             header["q_start_rad"] = q_rad.tolist()
-        return Reference.from_poses(T, self.time_s, header, self.confidence, self.video_time_s)
+        return Reference(T, self.time_s, twist, header, self.confidence, self.video_time_s)
 
     def stretched(self, factor: float) -> Reference:
         """The same path, `factor` times slower (or faster below 1), on knots of the same rate."""
@@ -300,8 +305,18 @@ def spline_poses(T: Array, time_s: Array, at_s: Array) -> Array:
 
 def twist_of(T: Array, time_s: Array) -> Array:
     """(N, 6) twist of poses (N, 4, 4): v in m/s, omega in rad/s, world; central differences, one-sided at the ends."""
-    n = len(time_s)
-    before, after = np.maximum(np.arange(n) - 1, 0), np.minimum(np.arange(n) + 1, n - 1)
-    span_s = (time_s[after] - time_s[before])[:, None]
+    before, after = _neighbours(len(time_s))
     rotation = Rotation.from_matrix(T[after, :3, :3]) * Rotation.from_matrix(T[before, :3, :3]).inv()
-    return np.asarray(np.hstack([T[after, :3, 3] - T[before, :3, 3], rotation.as_rotvec()]) / span_s)
+    angular = rotation.as_rotvec() / (time_s[after] - time_s[before])[:, None]
+    return np.asarray(np.hstack([_central_differences(T[:, :3, 3], time_s), angular]))
+
+
+def _neighbours(count: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Indices of the knots before and after each; at the ends the knot itself."""
+    index = np.arange(count)
+    return np.maximum(index - 1, 0), np.minimum(index + 1, count - 1)
+
+
+def _central_differences(values: Array, time_s: Array) -> Array:
+    before, after = _neighbours(len(time_s))
+    return np.asarray((values[after] - values[before]) / (time_s[after] - time_s[before])[:, None])

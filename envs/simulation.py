@@ -48,7 +48,8 @@ class Simulation:
     vessel_m (3,), vessel_R (3, 3), twist (6,) [m/s, rad/s, of the vessel's origin, world axes], particles_m (N, 3),
     where (N,) and share (3,) [held, poured, spilled; see `kernels.sort_particles`] tell the state after the last
     `refresh()`; the first two and the particles are views into the engine's memory. receptacle_m, receptacle_R: pose
-    of the receptacle, which is still. settled_held: how many particles stay in the vessel in the start pose.
+    of the receptacle, which is still. settled_m: (N, 3) where the particles rest in the vessel's frame, found by
+    letting them fall unless given; settled_held: how many of those places are in the vessel.
     """
 
     def __init__(
@@ -60,6 +61,7 @@ class Simulation:
         substeps: int,
         *,
         actuation: Literal["servo", "torque"] = "servo",
+        settled_m: Array | None = None,
         cameras: Sequence[CameraPose] = (),
     ) -> None:
         self.scene: Scene = build_scene(
@@ -69,9 +71,8 @@ class Simulation:
         self.data = mujoco.MjData(self.model)
         self.substeps, self._servo = substeps, actuation == "servo"
         self._bind(reference)
-        self._settled_m = self._settle(reference.q_start_rad)
-        self.settled_held = int(np.count_nonzero(self.scene.vessel_cavity.contains(self._settled_m)))
-        self._before = np.empty(mujoco.mj_stateSize(self.model, _PHYSICS))
+        self.settled_m = self._settle(reference.q_start_rad) if settled_m is None else settled_m
+        self.settled_held = int(np.count_nonzero(self.scene.vessel_cavity.contains(self.settled_m)))
 
     # ------------------------------------------------------------------ motion
 
@@ -79,7 +80,7 @@ class Simulation:
         """Rest in a posture (7,), the particles settled in the vessel, the receptacle at `receptacle_m` (3,)."""
         self.place_receptacle(receptacle_m)
         self._pose_arm(q_rad)
-        self.particles_m[:] = self._settled_m @ self.vessel_R.T + self.vessel_m
+        self.particles_m[:] = self.settled_m @ self.vessel_R.T + self.vessel_m
         self.refresh()
 
     def place_receptacle(self, position_m: Array) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 from typing import Literal
 
@@ -31,10 +32,19 @@ class Stage:
         substeps: int,
         actuation: Literal["servo", "torque"],
         cameras: Sequence[CameraPose],
+        alike: Stage | None = None,
     ) -> None:
+        """alike: a stage with the same vessel, whose particles' size and resting places are taken over."""
+        if alike is not None:
+            liquid = replace(liquid, radius_m=alike.simulation.scene.radius_m)
         self.base = self.reference = reference
         self._arguments = (reference, num_particles, liquid, timestep_s, substeps)
-        self.simulation = Simulation(*self._arguments, actuation=actuation, cameras=cameras)
+        self.simulation = Simulation(
+            *self._arguments,
+            actuation=actuation,
+            cameras=cameras,
+            settled_m=None if alike is None else alike.simulation.settled_m,
+        )
         self.pictures = Cameras(self.simulation.model)
         self._variation = ModelVariation(self.simulation.model)
         self.targets = self._base_targets = Targets.of(reference)
