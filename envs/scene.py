@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING, Any, Literal
 
 import mujoco
@@ -157,6 +158,7 @@ def _set_options(spec: mujoco.MjSpec, timestep_s: float) -> None:
     sky.rgb1, sky.rgb2 = [0.62, 0.74, 0.88], [0.93, 0.95, 0.97]
 
 
+@cache
 def _wood(size: int = 256) -> bytes:
     """RGB bytes of planks with a fine grain, the same at every call."""
     v, u = np.mgrid[0:size, 0:size] / size
