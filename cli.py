@@ -20,6 +20,7 @@ from .extract.errors import UserError
 from .extract.files import atomic_path, write_json
 from .extract.progress import Terminal
 from .extract.stages import Stage, plain, run_stages
+from .extract.wording import as_lines, measures_of
 
 Box = tuple[float, float, float, float]
 Result = Mapping[str, Any]
@@ -53,7 +54,7 @@ class Command:
 
     def words(self, result: Result) -> str:
         """The result for a person."""
-        return "\n".join(_lines(result))
+        return "\n".join(as_lines(result))
 
     def status(self, result: Result) -> int:
         """The exit status: 0 when all is well, 1 when the work is done and its finding is bad."""
@@ -77,7 +78,7 @@ class Staged(Command):
         return record | {"stages": {stage.name: record["stages"][stage.name] for stage in stages}}
 
     def words(self, result: Result) -> str:
-        text = [line for stage in result["stages"].values() for line in _lines(stage["figures"])]
+        text = [line for stage in result["stages"].values() for line in as_lines(stage["figures"])]
         written = [name for stage in result["stages"].values() for name in stage["outputs"]]
         text.append(f"written to {self.out}: {', '.join(written)}")
         return "\n".join([*text, *(f"open {self.out / name}" for name in written if name == "report.html")])
@@ -236,11 +237,8 @@ class Replay(Command):
     def do(self) -> Result:
         from .demos.replay import replay
 
-        terminal = Terminal()
-        try:
+        with Terminal() as terminal:
             return replay(self.dataset, progress=terminal.progress)
-        finally:
-            terminal.end()
 
     def words(self, result: Result) -> str:
         from .demos.replay import as_text
@@ -249,6 +247,36 @@ class Replay(Command):
 
     def status(self, result: Result) -> int:
         return 0 if result["same_end"] == result["episodes"] else 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Play(Command):
+    """Watch the simulated robot pour, and the reference as a ghost: in MuJoCo's window, or without a screen in an mp4.
+
+    For example: vid2demo play --vessel bottle, vid2demo play runs/coffee/kettle.reference.npz --out coffee.mp4
+    """
+
+    reference: Positional[Annotated[Path | None, told("REFERENCE", "A *.reference.npz. Default: built in.")]] = None
+    joints: Annotated[Path | None, told("FILE", "The *.joints.npz to play. Default: solved for here.")] = None
+    vessel: Annotated[str | None, told("NAME", "Pour from this: mug, mug:3, ... Default: the reference's.")] = None
+    receptacle: Annotated[str | None, told("NAME", "Pour into this. Default: the reference's.")] = None
+    particles: Annotated[int, arg(metavar="N", help="How many particles are poured [count].")] = 100
+    randomization: Annotated[Literal["none", "low", "high"], arg(help="What the seed may change.")] = "none"
+    camera: Annotated[Literal["front", "side", "wrist"], arg(help="Where the mp4 is taken from.")] = "front"
+    size: Annotated[tuple[int, int], arg(metavar="W H", help="Size of the mp4's picture [px].")] = (640, 480)
+    out: Annotated[Path | None, told("FILE", "The mp4. Default: a window; without a screen runs/play.mp4.")] = None
+    seed: Seed = 0
+
+    def do(self) -> Result:
+        from .demos.joints import JointTrajectory
+        from .envs.play import play
+
+        arguments: dict[str, Any] = {"num_particles": self.particles, "randomization": self.randomization}
+        arguments |= {"vessel": self.vessel, "receptacle": self.receptacle}
+        arguments |= {"render_camera": self.camera, "render_size": self.size[::-1]}
+        q_rad = None if self.joints is None else JointTrajectory.load(self.joints).q_rad
+        with Terminal() as terminal:
+            return play(self.reference, q_rad, self.out, self.seed, arguments, terminal.progress)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -284,7 +312,7 @@ class Meshes(Command):
         from .extract.vessels import CATEGORIES, make_vessel, parameter_space, resolve_category
 
         if self.action == "list":
-            return {"categories": {category: _measures(make_vessel(category)) for category in CATEGORIES}}
+            return {"categories": {category: measures_of(make_vessel(category)) for category in CATEGORIES}}
         if self.name is None:
             raise UserError(f"meshes {self.action} needs a category; the library has {', '.join(CATEGORIES)}")
         vessel = make_vessel(category := resolve_category(self.name)[0], self.seed)
@@ -292,7 +320,7 @@ class Meshes(Command):
             key: {"value": vessel.params[key], "low": r.low, "high": r.high, "unit": r.unit}
             for key, r in parameter_space(category).items()
         }
-        shown: dict[str, Any] = {"category": category, "measures": _measures(vessel), "parameters": parameters}
+        shown: dict[str, Any] = {"category": category, "measures": measures_of(vessel), "parameters": parameters}
         if self.action == "show":
             return shown
         if self.out is None:
@@ -362,19 +390,9 @@ class Demo(Staged):
         return run(settings, self.out, force=self.force, listener=Terminal())
 
 
-def _measures(vessel: Any) -> dict[str, Any]:
-    """What tells one vessel from another, in the units a person reads."""
-    return {
-        "size_mm": [round(1e3 * float(extent), 1) for extent in vessel.extents_m],
-        "interior_ml": round(1e6 * vessel.interior_volume_m3),
-        "mass_g": round(1e3 * vessel.mass_kg),
-        "outlet": vessel.outlet.kind,
-        "symmetry": {0: "about z", 1: "none"}.get(vessel.symmetry.order, f"{vessel.symmetry.order}-fold about z"),
-    }
-
-
 COMMANDS: dict[str, type[Command]] = {
-    c.__name__.lower(): c for c in (Run, Extract, Retarget, Simulate, Collect, Replay, Report, Meshes, Synthesize, Demo)
+    c.__name__.lower(): c
+    for c in (Run, Extract, Retarget, Simulate, Play, Collect, Replay, Report, Meshes, Synthesize, Demo)
 }
 
 
@@ -430,20 +448,3 @@ def _dispatch(words: list[str]) -> int:
     result = plain(command.do())
     print(json.dumps(result, indent=2, allow_nan=False) if command.json else command.words(result))
     return command.status(result)
-
-
-def _lines(value: Mapping[str, Any], depth: int = 0) -> list[str]:
-    lines = []
-    for key, item in value.items():
-        name = "  " * depth + key.replace("_", " ")
-        if item in ({}, [], None):
-            lines.append(f"{name}: none")
-        elif isinstance(item, dict) and len(item) < 6 and not any(isinstance(v, (dict, list)) for v in item.values()):
-            lines.append(f"{name}: {', '.join(_lines(item))}")
-        elif isinstance(item, dict):
-            lines += [name, *_lines(item, depth + 1)]
-        elif isinstance(item, list) and any(isinstance(entry, (str, dict)) for entry in item):
-            lines += [name, *("  " * (depth + 1) + str(entry) for entry in item)]
-        else:
-            lines.append(f"{name}: {f'{item:.4g}' if isinstance(item, float) else item}")
-    return lines

@@ -7,6 +7,7 @@ import os
 import platform
 import threading
 import time
+import warnings
 from typing import Any
 
 import mujoco
@@ -217,11 +218,14 @@ def has_screen() -> bool:
 
 def require_screen() -> None:
     """Raise UserError unless a window can be opened."""
-    mend = "set DISPLAY, or use render_mode='rgb_array'"
+    mend = "set DISPLAY, or take pictures: render_mode='rgb_array', or `vid2demo play --out FILE.mp4`"
     if not has_screen():
         raise UserError(f"MuJoCo's viewer needs a screen and there is none here; {mend}")
     import glfw
 
     # MuJoCo asks this in a thread of its own, and waits for ever when the answer is no.
-    if not glfw.init():
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        opened = glfw.init()
+    if not opened:
         raise UserError(f"the screen {os.environ.get('DISPLAY', '')!r} cannot be opened for MuJoCo's viewer; {mend}")

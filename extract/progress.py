@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Self
 
 Progress = Callable[[int, int, str], None]
 """Called with the pieces done, the pieces in all and a few words."""
@@ -67,6 +67,12 @@ class Terminal(Listener):
 
     def skipped(self, title: str, number: int, count: int) -> None:
         self._say(f"[{number}/{count}] {title}: nothing has changed")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.end()
 
     def end(self) -> None:
         """Take the bar away."""

@@ -45,8 +45,8 @@ def test_help_names_every_command_and_begins_at_once() -> None:
 
 
 def test_commands_of_the_design_are_there() -> None:
-    wanted = {"run", "extract", "retarget", "simulate", "collect", "replay", "meshes", "synthesize", "report", "demo"}
-    assert set(cli.COMMANDS) == wanted
+    wanted = {"run", "extract", "retarget", "simulate", "play", "collect", "replay", "meshes", "synthesize", "report"}
+    assert set(cli.COMMANDS) == {*wanted, "demo"}
 
 
 @pytest.mark.parametrize("name", list(cli.COMMANDS))
@@ -60,7 +60,7 @@ def test_help_of_each_command_has_an_example_and_tells_every_option(
     assert f"For example: vid2demo {name}" in text
     for option, hint in typing.get_type_hints(cli.COMMANDS[name], include_extras=True).items():
         assert "help='" in repr(hint) or 'help="' in repr(hint), f"{option} has no help"
-    if name not in ("replay", "report", "meshes"):
+    if name not in ("play", "replay", "report", "meshes"):
         assert "--out DIR" in text
         assert "--force" in text
     assert "--json" in text
@@ -145,12 +145,26 @@ def test_object_and_receptacle_of_one_name_are_refused(tmp_path: Path, capsys: p
         ["retarget", "gone.track.npz"],
         ["simulate", "gone.reference.npz"],
         ["collect", "gone.reference.npz"],
+        ["play", "gone.reference.npz"],
+        ["play", "--joints", "gone.joints.npz"],
     ],
 )
 def test_missing_file_is_named(words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    line = refused(capsys, *words, "--out", tmp_path / "out")
-    assert words[1] in line
+    line = refused(capsys, *words, "--out", tmp_path / "out.mp4")
+    assert words[-1] in line
     assert "does not exist" in line
+
+
+def test_play_films_a_pour(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    film = tmp_path / "film.mp4"
+    words = ["play", "--vessel", "cup", "--particles", "5", "--size", "64", "48", "--out", str(film), "--json"]
+    assert cli.main(words) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["shown"] == str(film)
+    assert told["position_error_m"] < 0.002
+    with av.open(str(film)) as container:
+        assert (container.streams.video[0].width, container.streams.video[0].height) == (64, 48)
+    assert "gone" in refused(capsys, "play", "--vessel", "gone", "--out", film)
 
 
 def test_replay_of_no_dataset_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

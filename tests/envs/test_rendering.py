@@ -1,14 +1,12 @@
-"""Cameras, overlays and the viewer's window."""
+"""Cameras, one's own and built in, and what is drawn over their pictures."""
 
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Iterator
 from typing import Any
 
 import mujoco
-import mujoco.viewer
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -16,7 +14,7 @@ from vid2demo.envs.cameras import CAMERAS, CameraPose, add_cameras, chosen_camer
 from vid2demo.envs.overlays import OVERLAYS, Hud, Overlay, Overlays, overlay_names, write_hud
 from vid2demo.envs.pouring import PandaPourEnv
 from vid2demo.envs.reference import Reference
-from vid2demo.envs.rendering import Cameras, Viewer, has_screen
+from vid2demo.envs.rendering import Cameras
 from vid2demo.envs.scene import FLOOR_Z_M
 from vid2demo.extract.errors import UserError
 from vid2demo.extract.geometry import Array, look_at, project
@@ -308,90 +306,6 @@ def test_unknown_overlays_are_refused(names: Any) -> None:
         overlay_names(names)
 
 
-# ---------------------------------------------------------------------- the window
-
-
-class Window:
-    """Stands in for the viewer's handle where there is no screen."""
-
-    def __init__(self, model: mujoco.MjModel) -> None:
-        self.user_scn = mujoco.MjvScene(model, 1000)
-        self.running, self.synced, self.texts = True, 0, ()
-
-    def lock(self) -> Any:
-        import contextlib
-
-        return contextlib.nullcontext()
-
-    def is_running(self) -> bool:
-        return self.running
-
-    def sync(self) -> None:
-        self.synced += 1
-
-    def set_texts(self, texts: Any) -> None:
-        self.texts = texts
-
-    def close(self) -> None:
-        self.running = False
-
-
-@pytest.fixture
-def window(empty: PandaPourEnv, monkeypatch: pytest.MonkeyPatch) -> Window:
-    import vid2demo.envs.rendering as rendering
-
-    made = Window(empty.model)
-    monkeypatch.setattr(rendering, "require_screen", lambda: None)
-    monkeypatch.setattr(mujoco.viewer, "launch_passive", lambda *_, **__: made)
-    return made
-
-
-def test_viewer_shows_particles_and_overlays_of_this_moment_only(empty: PandaPourEnv, window: Window) -> None:
-    viewer = Viewer(empty.model, empty.data, fps=1000)
-    particles = np.zeros((7, 3)), 0.005
-    viewer.show(particles, Overlay(np.eye(4), np.zeros((4, 3)), HUD))
-    shapes = window.user_scn.ngeom
-    assert shapes > 7 + 3
-    assert "50 %" in window.texts[3]
-    viewer.show(particles)
-    assert window.user_scn.ngeom == 7
-    viewer.show()
-    assert (window.user_scn.ngeom, window.synced) == (0, 3)
-    assert viewer.is_open
-    viewer.close()
-    viewer.show()
-    assert (viewer.is_open, window.synced) == (False, 3)
-
-
-def test_viewer_keeps_real_time(empty: PandaPourEnv, window: Window) -> None:
-    viewer = Viewer(empty.model, empty.data, fps=50)
-    start = time.monotonic()
-    for _ in range(10):
-        viewer.show()
-    assert 0.19 <= time.monotonic() - start < 0.5
-
-
-def test_viewer_without_a_screen_names_the_mend(empty: PandaPourEnv, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("platform.system", lambda: "Linux")
-    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
-        monkeypatch.delenv(name, raising=False)
-    assert not has_screen()
-    with pytest.raises(UserError, match="rgb_array"):
-        Viewer(empty.model, empty.data, fps=25)
-
-
-@pytest.mark.filterwarnings("ignore::UserWarning")
-def test_viewer_with_a_screen_that_is_not_there_does_not_hang(
-    empty: PandaPourEnv, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("platform.system", lambda: "Linux")
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    monkeypatch.setenv("DISPLAY", ":7391")
-    assert has_screen()
-    with pytest.raises(UserError, match=":7391"):
-        Viewer(empty.model, empty.data, fps=25)
-
-
 # ---------------------------------------------------------------------- in the environment
 
 
@@ -416,33 +330,6 @@ def test_render_draws_the_overlays_and_the_observations_stay_free_of_them(mug_po
     assert drawn is not None
     assert np.array_equal(plain, observations[()]["top"])
     assert len(changed(plain, drawn)) > 100
-
-
-def test_window_follows_every_step_and_reset(mug_pour: Reference, monkeypatch: pytest.MonkeyPatch) -> None:
-    import vid2demo.envs.display as display
-    import vid2demo.envs.rendering as rendering
-
-    windows = []
-
-    def open_window(model: mujoco.MjModel, data: mujoco.MjData, **_: Any) -> Window:
-        windows.append(Window(model))
-        return windows[-1]
-
-    for module in (display, rendering):
-        monkeypatch.setattr(module, "require_screen", lambda: None)
-    monkeypatch.setattr(mujoco.viewer, "launch_passive", open_window)
-    env = PandaPourEnv(mug_pour, num_particles=0, control_hz=100.0, render_mode="human", overlays=("ghost", "trail"))
-    env.reset(seed=0)
-    for _ in range(4):
-        env.step(env.action_space.sample())
-    assert env.render() is None
-    (window,) = windows
-    assert window.synced == 6
-    assert window.user_scn.ngeom == 1 + 4
-    env.reset(seed=0)
-    assert window.user_scn.ngeom == 1
-    env.close()
-    assert not window.running
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,35 @@
+"""Results in words that a person reads."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+
+def measures_of(vessel: Any) -> dict[str, Any]:
+    """What tells one vessel from another, in the units a person reads."""
+    return {
+        "size_mm": [round(1e3 * float(extent), 1) for extent in vessel.extents_m],
+        "interior_ml": round(1e6 * vessel.interior_volume_m3),
+        "mass_g": round(1e3 * vessel.mass_kg),
+        "outlet": vessel.outlet.kind,
+        "symmetry": {0: "about z", 1: "none"}.get(vessel.symmetry.order, f"{vessel.symmetry.order}-fold about z"),
+    }
+
+
+def as_lines(value: Mapping[str, Any], depth: int = 0) -> list[str]:
+    """A nested result as lines of text, one entry a line where it is short."""
+    lines = []
+    for key, item in value.items():
+        name = "  " * depth + key.replace("_", " ")
+        if item in ({}, [], None):
+            lines.append(f"{name}: none")
+        elif isinstance(item, dict) and len(item) < 6 and not any(isinstance(v, (dict, list)) for v in item.values()):
+            lines.append(f"{name}: {', '.join(as_lines(item))}")
+        elif isinstance(item, dict):
+            lines += [name, *as_lines(item, depth + 1)]
+        elif isinstance(item, list) and any(isinstance(entry, (str, dict)) for entry in item):
+            lines += [name, *("  " * (depth + 1) + str(entry) for entry in item)]
+        else:
+            lines.append(f"{name}: {f'{item:.4g}' if isinstance(item, float) else item}")
+    return lines
