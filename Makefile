@@ -2,7 +2,7 @@
 SHELL := /bin/bash
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
-.PHONY: help env demo test test-fast lint type bench clean lock
+.PHONY: help env demo test test-fast test-physics lint type bench clean lock
 
 # The stamp stands for what the environment was made from: as long as it is there, set-up takes no time. The folder
 # counts too, because a virtual environment does not survive being moved.
@@ -18,7 +18,7 @@ PYTEST := $(TEST_ENV) $(BIN)/python -m pytest
 PYTEST_ARGS ?= -n 2 --dist loadfile
 
 help:  ## list the verbs
-	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-10s %s\n", $$1, $$2}' Makefile
+	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-14s %s\n", $$1, $$2}' Makefile
 
 env: $(STAMP)  ## .venv with exactly what requirements.lock names (finds Python 3.12 by itself)
 
@@ -29,10 +29,13 @@ demo: $(STAMP)  ## the whole way on a clip made here: video, robot, dataset; end
 	$(BIN)/vid2demo demo --out runs/demo
 
 test: $(STAMP)  ## the whole test suite
-	$(PYTEST) $(PYTEST_ARGS)
+	$(PYTEST) $(PYTEST_ARGS) -m "not exhaustive"
 
 test-fast: $(STAMP)  ## without the slow tests, under three minutes
-	$(PYTEST) $(PYTEST_ARGS) -m "not slow"
+	$(PYTEST) $(PYTEST_ARGS) -m "not slow and not exhaustive"
+
+test-physics: $(STAMP)  ## every vessel at 50, 100 and 300 particles in 20 violent motions: half an hour
+	$(PYTEST) $(PYTEST_ARGS) -m exhaustive
 
 lint: $(STAMP)  ## ruff: rules and formatting
 	$(BIN)/ruff check .

@@ -83,6 +83,33 @@ def test_no_category_leaks(category: str) -> None:
     assert [escapes(env, seed)[0] for seed in range(2)] == [0, 0]
 
 
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("count", [50, 100, 300])
+@pytest.mark.parametrize("category", CATEGORIES)
+def test_twenty_violent_motions_of_any_vessel_leak_nothing(category: str, count: int) -> None:
+    env = PandaPourEnv(still_reference(category), num_particles=count)
+    assert [escapes(env, seed)[0] for seed in range(20)] == [0] * 20
+
+
+@pytest.mark.parametrize(
+    "category",
+    [
+        category if category in ("mug", "bowl", "carton") else pytest.param(category, marks=pytest.mark.slow)
+        for category in CATEGORIES
+    ],
+)
+def test_what_stands_still_stays_still_and_gains_no_energy(category: str) -> None:
+    env = PandaPourEnv(still_reference(category), num_particles=100)
+    simulation, action = env.simulation, env.reference.q_start_rad.astype(np.float32)
+    env.reset(seed=0)
+    speeds = []
+    for _ in range(75):
+        env.step(action)
+        speeds.append(np.linalg.norm(simulation.particle_velocities_m_s, axis=1).max())
+    assert max(speeds[25:]) < 0.02, "at rest within a second, and for good"
+    assert simulation.share[0] == 1.0
+
+
 @pytest.mark.parametrize("category", ["mug", "bowl", "wine_glass", "carton"])
 def test_what_falls_hard_into_a_receptacle_stays_in_it(category: str) -> None:
     env = PandaPourEnv(still_reference("gooseneck_kettle", category), num_particles=60)
