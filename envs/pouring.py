@@ -171,6 +171,7 @@ class PandaPourEnv(gym.Env[Observation, NDArray[np.float32]]):
         self.task = f"pour from the {scene.vessel.category} into the {scene.receptacle.category}".replace("_", " ")
         self.task_description = self.task
         self.action_space = self._control.space
+        self.action_names = tuple(entry.name for entry in self._control.entries)
         self.observation_space, self.observation_names = observations.space(obs_mode, self.cameras, self.image_size)
         self._starts = StartSampler(self._start or ReferenceStart(), len(self._base))
         self._seed: int | None = None
