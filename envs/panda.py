@@ -24,6 +24,7 @@ from ..extract.geometry import Array
 
 ARM_JOINTS = tuple(f"panda_joint{i}" for i in range(1, 8))
 FINGER_JOINTS = ("panda_finger_joint1", "panda_finger_joint2")
+PADS = ("panda_leftfinger_pad", "panda_rightfinger_pad")
 LINKS = (*(f"panda_link{i}" for i in range(8)), "panda_hand", "panda_leftfinger", "panda_rightfinger")
 TCP_SITE = "tcp"
 
@@ -34,8 +35,8 @@ DQ_MAX_RAD_S: Array = np.array([2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 2.61])
 TAU_MAX_NM: Array = np.array([87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0])
 Q_HOME_RAD: Array = np.array([0.0, -0.785398, 0.0, -2.35619, 0.0, 1.5707, 0.785398])
 FINGER_MAX_M = 0.04
-# What the Franka Hand can press with for as long as one likes.
-FINGER_MAX_N = 70.0
+# What the Franka Hand can press with for as long as one likes, and the stiffness of its servos here.
+FINGER_MAX_N, FINGER_N_M = 70.0, 1000.0
 
 # Stiffness and damping of the joint servos. Natural frequencies lie near 9 Hz at the shoulder and 14 Hz at the wrist
 # with damping ratio about 1: fast enough to follow 25 Hz targets, slow enough that a step between two targets
@@ -121,7 +122,9 @@ def panda_spec(visuals: bool = True, actuation: Literal["servo", "torque"] = "se
     for name in FINGER_JOINTS:
         joint = spec.joint(name)
         joint.armature, joint.damping = 0.1, np.array([1.0, 0.0, 0.0])
-        servo = _add_servo(spec, name, 1000.0, 20.0)
+        # A hand that has lost what it held presses on the stop.
+        joint.solref_limit[:2], joint.solimp_limit[:2] = (0.004, 1.0), (0.99, 0.999)
+        servo = _add_servo(spec, name, FINGER_N_M, 20.0)
         servo.forcelimited, servo.forcerange = mujoco.mjtLimited.mjLIMITED_TRUE, (-FINGER_MAX_N, FINGER_MAX_N)
     spec.body("panda_hand_tcp").add_site(name=TCP_SITE, size=[0.005, 0.005, 0.005], group=4)
     if visuals:

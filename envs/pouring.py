@@ -22,6 +22,7 @@ from .cameras import CameraPose
 from .control import CONTROL_MODES, Control, ControlState
 from .display import Display, render_modes
 from .diverged import PhysicsError, diverged_message
+from .holding import Grasp
 from .kernels import HELD, POURED, SPILLED
 from .liquid import Liquid
 from .options import (
@@ -98,6 +99,8 @@ class PandaPourEnv(gym.Env[Observation, NDArray[np.float32]]):
     randomization: none, low, high, or a `Randomization`.
     start: "beginning", "reference" (anywhere along it), or a `ReferenceStart`.
     termination: "never", "lost" (0.25 m or 0.8 rad from the reference), or a `Termination`.
+    grasp: "weld" makes the vessel a part of the hand; with "friction" the fingers hold it by contact alone, at about
+        three times the cost, and `info` tells how far it has slipped.
     settle_s: time after the reference's end in which the last reference pose is held.
     success_poured_fraction, success_spilled_fraction: success means at least and at most so much; without particles,
         to have stayed within 5 cm and 0.3 rad of the reference to its end.
@@ -134,9 +137,11 @@ class PandaPourEnv(gym.Env[Observation, NDArray[np.float32]]):
         start: str | ReferenceStart | Mapping[str, Any] = "beginning",
         termination: str | Termination | Mapping[str, Any] = "never",
         tolerance: float = 1.0,
+        grasp: Grasp = "weld",
         overlays: Sequence[str] = (),
     ) -> None:
         one_of("obs_mode", obs_mode, ("state", "pixels", "both"))
+        one_of("grasp", grasp, ("weld", "friction"))
         one_of("control_mode", control_mode, CONTROL_MODES)
         check_number("settle_s", settle_s, 0.0, 60.0)
         check_number("success_poured_fraction", success_poured_fraction, 0.0, 1.0)
@@ -151,6 +156,7 @@ class PandaPourEnv(gym.Env[Observation, NDArray[np.float32]]):
         self.termination = preset("termination", termination, TERMINATIONS, Termination)
         self._start = preset("start", start, STARTS, ReferenceStart)
         self.obs_mode, self.control_mode = obs_mode, control_mode
+        self.grasp: Grasp = grasp
         self.image_size = picture_size("image_size", image_size)
         render_size = picture_size("render_size", render_size)
         self.render_mode = render_mode
@@ -388,6 +394,7 @@ class PandaPourEnv(gym.Env[Observation, NDArray[np.float32]]):
                 self.timestep_s,
                 self._substeps,
                 self._control.actuation,
+                self.grasp,
                 self._own_cameras,
                 self._stages.get(-1),
             )
@@ -459,6 +466,8 @@ class PandaPourEnv(gym.Env[Observation, NDArray[np.float32]]):
             "is_success": self.is_success,
             "outlet": "spout_conduit" if scene.vessel.outlet.kind == "spout" else "lip",
         }
+        if self.simulation.holding.free:
+            info["slip_m"], info["slip_rad"] = self.simulation.holding.slip()
         if self.simulation.settled_held < scene.num_particles:
             lost = scene.num_particles - self.simulation.settled_held
             info["start_warning"] = f"{lost} particles run out in the start pose: the vessel is tilted or too full"

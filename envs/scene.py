@@ -19,6 +19,8 @@ from scipy.spatial.transform import Rotation
 from ..extract.errors import UserError
 from ..extract.geometry import Array, invert_pose, make_pose, transform_points
 from .cameras import CameraPose, add_cameras
+from .holding import Grasp, add_grip, set_grasp_options
+from .kinematics import HAND_BODY
 from .liquid import Liquid, add_particles
 from .panda import CONTACT_HELD, CONTACT_PARTICLE, CONTACT_ROBOT, CONTACT_VESSEL, panda_spec
 from .vessel_geometry import STANDING_WALL_M, Box, Cavity, cavity_of, collision_boxes, visual_parts
@@ -65,11 +67,13 @@ def build_scene(
     timestep_s: float,
     *,
     actuation: Literal["servo", "torque"] = "servo",
+    grasp: Grasp = "weld",
     cameras: Sequence[CameraPose] = (),
 ) -> Scene:
     """Build and compile the scene of a reference, with `cameras` beside the built-in ones.
 
-    Raises UserError when the receptacle would stand in the table.
+    grasp: "weld" makes the vessel a part of the hand, "friction" a free body that the fingers hold.
+    Raises UserError when the receptacle would stand in the table, or when the fingers cannot close on the vessel.
     """
     vessel, receptacle = reference.vessel(), reference.receptacle()
     vessel_cavity, receptacle_cavity = cavity_of(vessel), cavity_of(receptacle)
@@ -82,7 +86,7 @@ def build_scene(
     _set_options(spec, timestep_s)
     # As stiff as the step allows. The impedance is a little below MuJoCo's default: with it eight solver iterations
     # settle a pile that is shaken, where at 0.9 one particle in two thousand was squeezed through a wall.
-    contact = {
+    contact: dict[str, Any] = {
         "condim": 3 if liquid.friction > 0.0 else 1,
         "friction": [liquid.friction, 0.0, 0.0],
         "solref": [2 * timestep_s, 1.0],
@@ -91,12 +95,17 @@ def build_scene(
     _add_furniture(spec, contact)
     vessel_contact = {**contact, "contype": CONTACT_VESSEL, "conaffinity": CONTACT_PARTICLE}
     vessel_boxes = collision_boxes(vessel, vessel_cavity)
-    # The vessel is a part of the hand's own tree, not a free body tied by a weld constraint: it cannot slip or lag, and
-    # it costs the contact solver nothing. What a hand of rubber and steel would give way is left out.
-    held = spec.body("panda_hand_tcp").add_body(name=VESSEL_BODY, **_placed(reference.T_hand_object))
+    if grasp == "weld":
+        # A part of the hand's own tree, not a free body tied by a weld constraint: it cannot slip or lag, and it costs
+        # the contact solver nothing. What a hand of rubber and steel would give way is left out.
+        held = spec.body(HAND_BODY).add_body(name=VESSEL_BODY, gravcomp=1.0, **_placed(reference.T_hand_object))
+    else:
+        held = spec.worldbody.add_body(name=VESSEL_BODY, **_placed(reference.T_world_object[0]))
+        held.add_freejoint()
+        add_grip(spec, held, vessel, reference.T_hand_object, timestep_s)
+        set_grasp_options(spec.option)
     _add_vessel(spec, held, vessel, vessel_boxes, vessel_contact)
     _add_hull(spec, held, vessel, contact)
-    held.gravcomp = 1.0
     standing = spec.worldbody.add_body(name=RECEPTACLE_BODY, **_placed(T_world_receptacle))
     standing_boxes = collision_boxes(receptacle, receptacle_cavity, STANDING_WALL_M)
     _add_vessel(spec, standing, receptacle, standing_boxes, vessel_contact)
@@ -266,7 +275,7 @@ def _add_hull(spec: mujoco.MjSpec, body: mujoco.MjsBody, vessel: Vessel, contact
     mesh = spec.add_mesh(name=f"{body.name}_hull", uservert=shrunk.ravel(), userface=np.asarray(hull.faces).ravel())
     mesh.maxhullvert = HULL_VERTICES
     geom = body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, name=mesh.name, meshname=mesh.name)
-    geom.contype, geom.conaffinity, geom.condim = CONTACT_HELD, 0, contact["condim"]
+    geom.contype, geom.conaffinity, geom.condim = CONTACT_HELD, 0, 3
     geom.solref[:2], geom.solimp, geom.group, geom.mass = contact["solref"], contact["solimp"], 3, 0.0
 
 

@@ -18,12 +18,12 @@ from ..extract.errors import UserError
 from ..extract.geometry import Array, make_pose
 from .cameras import CameraPose
 from .contacts import RobotContacts
+from .holding import Grasp, Holding, still_arm
 from .kernels import sort_particles, vessel_twist
 from .liquid import Liquid, SpoutConduit, fill_positions, level_share
 from .panda import ARM_JOINTS, FINGER_JOINTS
 from .reference import Reference
 from .scene import RECEPTACLE_BODY, VESSEL_BODY, Scene, build_scene
-from .vessel_geometry import gripper_half_width_m
 
 # The spout's conduit looks at the particles every so many physics steps.
 CONDUIT_STRIDE = 2
@@ -34,11 +34,12 @@ ARM = 7
 
 @dataclass(frozen=True)
 class Motion:
-    """Positions and velocities in the engine's order, the vessel's pose (4, 4) and where the particles (N,) were."""
+    """Positions and velocities in the engine's order, the vessel's poses (4, 4) and where the particles (N,) were."""
 
     qpos: Array
     qvel: Array
     T_world_vessel: Array
+    T_hand_object: Array
     where: NDArray[np.uint8]
 
 
@@ -48,8 +49,8 @@ class Simulation:
     vessel_m (3,), vessel_R (3, 3), twist (6,) [m/s, rad/s, of the vessel's origin, world axes], particles_m (N, 3),
     where (N,) and share (3,) [held, poured, spilled; see `kernels.sort_particles`] tell the state after the last
     `refresh()`; the first two and the particles are views into the engine's memory. receptacle_m, receptacle_R: pose
-    of the receptacle, which is still. settled_m: (N, 3) where the particles rest in the vessel's frame, found by
-    letting them fall unless given; settled_held: how many of those places are in the vessel.
+    of the receptacle, which is still. settled_m: (N, 3) where the particles rest in the vessel's frame; settled_held:
+    how many of those places are in the vessel. holding: how the vessel is held, and how far it has slipped.
     """
 
     def __init__(
@@ -61,17 +62,21 @@ class Simulation:
         substeps: int,
         *,
         actuation: Literal["servo", "torque"] = "servo",
-        settled_m: Array | None = None,
+        grasp: Grasp = "weld",
+        alike: Simulation | None = None,
         cameras: Sequence[CameraPose] = (),
     ) -> None:
+        """alike: one with the same vessel, whose settled particles and closed hand are taken over."""
         self.scene: Scene = build_scene(
-            reference, num_particles, liquid, timestep_s, actuation=actuation, cameras=cameras
+            reference, num_particles, liquid, timestep_s, actuation=actuation, grasp=grasp, cameras=cameras
         )
         self.model: mujoco.MjModel = self.scene.model
         self.data = mujoco.MjData(self.model)
         self.substeps, self._servo = substeps, actuation == "servo"
         self._bind(reference)
-        self.settled_m = self._settle(reference.q_start_rad) if settled_m is None else settled_m
+        if alike is not None:
+            self.holding.take_over(alike.holding)
+        self.settled_m: Array = self._settle(reference.q_start_rad) if alike is None else alike.settled_m
         self.settled_held = int(np.count_nonzero(self.scene.vessel_cavity.contains(self.settled_m)))
 
     # ------------------------------------------------------------------ motion
@@ -160,12 +165,15 @@ class Simulation:
 
     def get_motion(self) -> Motion:
         """Positions and velocities alone, from which `set_motion` continues elsewhere in the world."""
-        return Motion(self.data.qpos.copy(), self.data.qvel.copy(), self.T_world_vessel, self.where.copy())
+        qpos, qvel = self.data.qpos.copy(), self.data.qvel.copy()
+        return Motion(qpos, qvel, self.T_world_vessel, self.holding.T_hand_object, self.where.copy())
 
     def set_motion(self, motion: Motion, q_rad: Array) -> None:
         """Take over a motion with the arm at `q_rad` (7,); the particles stay where they are in the world."""
-        self._pose_arm(q_rad)
-        self.data.qpos[ARM:], self.data.qvel[:] = motion.qpos[ARM:], motion.qvel
+        self._pose_arm(q_rad, motion.T_hand_object)
+        for part in (slice(ARM, ARM + 2), slice(self._first_particle, None)):
+            self.data.qpos[part] = motion.qpos[part]
+        self.data.qvel[:] = motion.qvel
         mujoco.mj_kinematics(self.model, self.data)
 
     # ------------------------------------------------------------------ inside
@@ -173,14 +181,16 @@ class Simulation:
     def _bind(self, reference: Reference) -> None:
         model, data, scene = self.model, self.data, self.scene
         arm = [int(model.joint(name).qposadr[0]) for name in (*ARM_JOINTS, *FINGER_JOINTS)]
-        if arm != list(range(9)) or model.nq != 9 + 3 * scene.num_particles:
-            raise RuntimeError("the scene's joints are not in the order arm, fingers, particles")
+        self.holding = Holding(model, data, scene.vessel, reference.T_hand_object)
+        self._first_particle = 9 + self.holding.positions
+        if arm != list(range(9)) or model.nq != self._first_particle + 3 * scene.num_particles:
+            raise RuntimeError("the scene's joints are not in the order arm, fingers, free vessel, particles")
         vessel_id, self._receptacle_id = int(model.body(VESSEL_BODY).id), int(model.body(RECEPTACLE_BODY).id)
         # Views into the engine's memory: always the pose of the last kinematics.
         self.vessel_m, self.vessel_R = data.xpos[vessel_id], data.xmat[vessel_id].reshape(3, 3)
         self._axes, self._anchors_m, self._rates = data.xaxis[:ARM], data.xanchor[:ARM], data.qvel[:ARM]
-        self.particles_m = data.qpos[9:].reshape(-1, 3)
-        self.particle_velocities_m_s = data.qvel[9:].reshape(-1, 3)
+        self.particles_m = data.qpos[self._first_particle :].reshape(-1, 3)
+        self.particle_velocities_m_s = data.qvel[9 + self.holding.velocities :].reshape(-1, 3)
         self.twist: Array = np.zeros(6)
         self._robot_contacts = RobotContacts(model)
         self.where: NDArray[np.uint8] = np.zeros(scene.num_particles, np.uint8)
@@ -188,7 +198,6 @@ class Simulation:
         self.receptacle_m: Array = scene.T_world_receptacle[:3, 3].copy()
         self.receptacle_R: Array = scene.T_world_receptacle[:3, :3].copy()
         self._vessel_hollow, self._receptacle_hollow = scene.vessel_cavity.arrays, scene.receptacle_cavity.arrays
-        self._gripper_m = gripper_half_width_m(scene.vessel, reference.T_hand_object)
         self._conduit = self._make_conduit() if scene.vessel.outlet.kind == "spout" and scene.num_particles else None
 
     def _make_conduit(self) -> SpoutConduit:
@@ -197,26 +206,30 @@ class Simulation:
         return SpoutConduit(scene.vessel, scene.vessel_cavity, scene.vessel_boxes, scene.radius_m, share)
 
     def _settle(self, q_rad: Array) -> Array:
-        """(N, 3) resting places of the particles in the vessel's frame."""
+        """(N, 3) resting places of the particles in the vessel's frame; meanwhile the hand closes on a free vessel."""
         scene = self.scene
         lattice = fill_positions(
             scene.vessel_cavity, scene.vessel_boxes, scene.num_particles, scene.radius_m, scene.vessel.category
         )
         self._pose_arm(q_rad)
         self.particles_m[:] = lattice @ self.vessel_R.T + self.vessel_m
-        if scene.num_particles:
-            mujoco.mj_step(self.model, self.data, round(SETTLE_AT_START_S / self.model.opt.timestep))
-            mujoco.mj_kinematics(self.model, self.data)
+        with still_arm(self.model):
+            self.holding.close()
+            if scene.num_particles:
+                mujoco.mj_step(self.model, self.data, round(SETTLE_AT_START_S / self.model.opt.timestep))
+        self.holding.keep()
         return np.asarray((self.particles_m - self.vessel_m) @ self.vessel_R)
 
-    def _pose_arm(self, q_rad: Array) -> None:
+    def _pose_arm(self, q_rad: Array, T_hand_object: Array | None = None) -> None:
         mujoco.mj_resetData(self.model, self.data)
         self.data.qpos[:ARM] = q_rad
-        self.data.qpos[ARM : ARM + 2] = self.data.ctrl[ARM : ARM + 2] = self._gripper_m
         if self._servo:
             self.data.ctrl[:ARM] = q_rad
-        mujoco.mj_kinematics(self.model, self.data)
+        self.holding.pose(T_hand_object)
 
     def _read_twist(self) -> None:
+        if self.holding.free:
+            self.holding.read_twist(self.twist)
+            return
         # Seven joints move the vessel; the engine's own velocities would first go through every particle.
         vessel_twist(self._axes, self._anchors_m, self._rates, self.vessel_m, self.twist)

@@ -11,6 +11,7 @@ import numpy as np
 
 from ..extract.geometry import Array
 from .cameras import CameraPose
+from .holding import Grasp
 from .liquid import Liquid
 from .observations import Targets
 from .randomization import Draw, ModelVariation
@@ -31,6 +32,7 @@ class Stage:
         timestep_s: float,
         substeps: int,
         actuation: Literal["servo", "torque"],
+        grasp: Grasp,
         cameras: Sequence[CameraPose],
         alike: Stage | None = None,
     ) -> None:
@@ -39,11 +41,13 @@ class Stage:
             liquid = replace(liquid, radius_m=alike.simulation.scene.radius_m)
         self.base = self.reference = reference
         self._arguments = (reference, num_particles, liquid, timestep_s, substeps)
-        self.simulation = Simulation(
+        self._grasp = grasp
+        self.simulation: Simulation = Simulation(
             *self._arguments,
             actuation=actuation,
+            grasp=grasp,
             cameras=cameras,
-            settled_m=None if alike is None else alike.simulation.settled_m,
+            alike=None if alike is None else alike.simulation,
         )
         self.pictures = Cameras(self.simulation.model)
         self._variation = ModelVariation(self.simulation.model)
@@ -69,4 +73,4 @@ class Stage:
     @cached_property
     def rehearsal(self) -> Rehearsal:
         """The states along the reference; played through when first asked for."""
-        return Rehearsal(self.base, Simulation(*self._arguments))
+        return Rehearsal(self.base, Simulation(*self._arguments, grasp=self._grasp, alike=self.simulation))
