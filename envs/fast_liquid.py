@@ -64,7 +64,7 @@ class FastLiquid:
         self._walls = _walls(groups, radius_m + REACH_M)
         self._poses: Array = np.tile(np.eye(4), (len(groups), 2, 1, 1))
         buckets = 1 << max(6, (2 * count - 1).bit_length())
-        self._last: Array = np.zeros((count, 3))
+        self._room = (*(np.zeros((count, 3)) for _ in range(3)), np.zeros(count, np.int32))
         self._pairs = np.zeros((kernels.MAX_PAIRS * count, 2), np.int32)
         self._grid = (np.zeros((count, 4), np.int32), np.zeros(buckets + 1, np.int32), np.zeros(count, np.int32))
         self._which = np.zeros((kernels.MAX_CONTACTS * count, 2), np.int32)
@@ -84,7 +84,7 @@ class FastLiquid:
         kernels.advance(
             self.positions_m,
             self.velocities_m_s,
-            self._last,
+            self._room,
             poses,
             *self._walls,
             self._pairs,

@@ -170,10 +170,11 @@ def _bucket(a: int, b: int, c: int, mask: int) -> int:
 
 @njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def find_contacts(
-    x: Array,
-    v: Array,
+    first: Array,
+    goal: Array,
+    chosen: Ints,
+    chosen_count: int,
     radius_m: float,
-    timestep_s: float,
     shapes: Array,
     groups: Ints,
     lows: Array,
@@ -183,30 +184,25 @@ def find_contacts(
     which: Ints,
     contacts: Array,
 ) -> int:
-    """Planes that hold the particles back from the walls in this step; their number.
+    """Planes that hold the chosen particles back from the walls on their ways from `first` to `goal`; their number.
 
-    Each particle's way is followed in the frame of each group, where the walls stand still, up to the first touch with
-    each shape (conservative advancement): the tangent plane there is the contact, so nothing is jumped over. Rows of
-    `contacts`: the plane's normal and offset before the step and their change, and the way of its foot, in the world.
+    Each way is followed in the frame of each group, where the walls stand still, up to the first touch with each shape
+    (conservative advancement): the tangent plane there is the contact, so nothing is jumped over. Rows of `contacts`:
+    the plane's normal and offset before the step and their change, and the way of its foot, in the world.
     """
     found = 0
     room = len(which)
     slack, arrived = SLACK_RADII * radius_m, ARRIVED_RADII * radius_m
-    fall = 0.5 * GRAVITY_M_S2 * timestep_s * timestep_s
     for g in range(len(groups)):
         before, after = poses[g, 0], poses[g, 1]
         cell_m, reach_m = lows[g, 3], lows[g, 4]
-        for i in range(len(x)):
-            ax, ay, az = _inside(before, x[i, 0], x[i, 1], x[i, 2])
-            bx, by, bz = _inside(
-                after,
-                x[i, 0] + timestep_s * v[i, 0],
-                x[i, 1] + timestep_s * v[i, 1],
-                x[i, 2] + timestep_s * v[i, 2] - fall,
-            )
+        for n in range(chosen_count):
+            i = chosen[n]
+            ax, ay, az = _inside(before, first[i, 0], first[i, 1], first[i, 2])
+            bx, by, bz = _inside(after, goal[i, 0], goal[i, 1], goal[i, 2])
             bx, by, bz = bx - ax, by - ay, bz - az
             way = math.sqrt(bx * bx + by * by + bz * bz)
-            first, last = groups[g, 0], groups[g, 1]
+            low, high = groups[g, 0], groups[g, 1]
             # Looked up in the middle of the way, from where half of it reaches everything.
             listed = 0.5 * way < reach_m - slack
             if listed:
@@ -216,8 +212,8 @@ def find_contacts(
                 if not (0 <= cx < groups[g, 3] and 0 <= cy < groups[g, 4] and 0 <= cz < groups[g, 5]):
                     continue
                 cell = groups[g, 2] + (cx * groups[g, 4] + cy) * groups[g, 5] + cz
-                first, last = starts[cell], starts[cell + 1]
-            for place in range(first, last):
+                low, high = starts[cell], starts[cell + 1]
+            for place in range(low, high):
                 k = items[place] if listed else place
                 if not within(shapes, k, ax, ay, az, radius_m + way + slack):
                     continue
@@ -331,7 +327,6 @@ def project_contacts(
     step: float,
     friction: float,
     h: float,
-    radius_m: float,
     origin: Array,
     moved: Array,
 ) -> None:
@@ -367,21 +362,59 @@ def project_contacts(
         x[i, 1] += my
         x[i, 2] += mz
         if which[k, 1] == 0:
-            ax, ay, az = x[i, 0] - radius_m * nx, x[i, 1] - radius_m * ny, x[i, 2] - radius_m * nz
-            ax, ay, az = ax - origin[0], ay - origin[1], az - origin[2]
-            moved[0] += mx
-            moved[1] += my
-            moved[2] += mz
-            moved[3] += ay * mz - az * my
-            moved[4] += az * mx - ax * mz
-            moved[5] += ax * my - ay * mx
+            _felt(x, i, origin, mx, my, mz, moved)
+
+
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def catch(
+    x: Array,
+    v: Array,
+    which: Ints,
+    contacts: Array,
+    count: int,
+    timestep_s: float,
+    h: float,
+    origin: Array,
+    moved: Array,
+) -> None:
+    """At the end of a step, put particles back in front of walls and take from them the speed into the wall."""
+    for _ in range(2):
+        for k in range(count):
+            i, c = which[k, 0], contacts[k]
+            nx, ny, nz = c[0] + c[4], c[1] + c[5], c[2] + c[6]
+            depth = c[3] + c[7] - (nx * x[i, 0] + ny * x[i, 1] + nz * x[i, 2])
+            if depth <= 0.0:
+                continue
+            x[i, 0] += depth * nx
+            x[i, 1] += depth * ny
+            x[i, 2] += depth * nz
+            into = (nx * c[8] + ny * c[9] + nz * c[10]) / timestep_s - (nx * v[i, 0] + ny * v[i, 1] + nz * v[i, 2])
+            if into <= 0.0:
+                continue
+            v[i, 0] += into * nx
+            v[i, 1] += into * ny
+            v[i, 2] += into * nz
+            if which[k, 1] == 0:
+                _felt(x, i, origin, h * into * nx, h * into * ny, h * into * nz, moved)
+
+
+@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _felt(x: Array, i: int, origin: Array, mx: float, my: float, mz: float, moved: Array) -> None:
+    """Add a way (3 numbers) that a wall gave particle i, and its moment about `origin`, to `moved` (6,)."""
+    ax, ay, az = x[i, 0] - origin[0], x[i, 1] - origin[1], x[i, 2] - origin[2]
+    moved[0] += mx
+    moved[1] += my
+    moved[2] += mz
+    moved[3] += ay * mz - az * my
+    moved[4] += az * mx - ax * mz
+    moved[5] += ax * my - ay * mx
 
 
 @njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def advance(
     x: Array,
     v: Array,
-    last: Array,
+    room: tuple[Any, Any, Any, Any],
     poses: Array,
     shapes: Array,
     groups: Ints,
@@ -397,12 +430,18 @@ def advance(
 ) -> None:
     """One step in small substeps, each with one sweep over all constraints (Macklin et al. 2019)."""
     radius_m, timestep_s, friction, drag_1_s, substeps = numbers
+    first, goal, last, chosen = room
+    fall = 0.5 * GRAVITY_M_S2 * timestep_s * timestep_s
     for i in range(len(x)):
+        chosen[i] = i
         for axis in range(3):
+            first[i, axis] = x[i, axis]
             last[i, axis] = x[i, axis] + 0.5 * timestep_s * v[i, axis]
+            goal[i, axis] = x[i, axis] + timestep_s * v[i, axis]
+        goal[i, 2] -= fall
     pair_count = find_pairs(last, radius_m, pairs, grid[0], grid[1], grid[2])
-    contact_count = find_contacts(
-        x, v, radius_m, timestep_s, shapes, groups, lows, starts, items, poses, which, contacts
+    count = find_contacts(
+        first, goal, chosen, len(x), radius_m, shapes, groups, lows, starts, items, poses, which, contacts
     )
     h = timestep_s / substeps
     kept = 1.0 / (1.0 + drag_1_s * h)
@@ -416,20 +455,20 @@ def advance(
                 last[i, axis] = x[i, axis]
                 x[i, axis] += h * v[i, axis]
         project_pairs(x, last, pairs, pair_count, radius_m, friction, h)
-        project_contacts(
-            x,
-            last,
-            which,
-            contacts,
-            contact_count,
-            (s + 1) / substeps,
-            1 / substeps,
-            friction,
-            h,
-            radius_m,
-            origin,
-            moved,
-        )
+        share, part = (s + 1) / substeps, 1 / substeps
+        project_contacts(x, last, which, contacts, count, share, part, friction, h, origin, moved)
         for i in range(len(x)):
             for axis in range(3):
                 v[i, axis] = (x[i, axis] - last[i, axis]) / h
+    # Who was knocked off the foreseen way may have met walls that nobody looked for.
+    strayed = 0
+    far = SLACK_RADII * radius_m
+    for i in range(len(x)):
+        dx, dy, dz = x[i, 0] - goal[i, 0], x[i, 1] - goal[i, 1], x[i, 2] - goal[i, 2]
+        if dx * dx + dy * dy + dz * dz > far * far:
+            chosen[strayed] = i
+            strayed += 1
+    count = find_contacts(
+        first, x, chosen, strayed, radius_m, shapes, groups, lows, starts, items, poses, which, contacts
+    )
+    catch(x, v, which, contacts, count, timestep_s, h, origin, moved)
