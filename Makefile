@@ -2,7 +2,7 @@
 SHELL := /bin/bash
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
-.PHONY: help env demo test test-fast test-physics lint type bench clean lock
+.PHONY: help env demo test test-fast test-physics lint type bench bench-peers docs clean lock
 
 # The stamp stands for what the environment was made from: as long as it is there, set-up takes no time. The folder
 # counts too, because a virtual environment does not survive being moved.
@@ -49,7 +49,13 @@ type: $(STAMP)  ## mypy --strict on the four packages and the command
 
 bench: $(STAMP)  ## the measurements of bench/, one after the other
 	@set -e; for script in bench/[a-z]*.py; do \
-	  if [ -e "$$script" ]; then echo "== $$script"; OMP_NUM_THREADS=1 $(BIN)/python "$$script"; fi; done
+	  if [ -e "$$script" ] && [ "$$script" != bench/peers.py ]; then echo "== $$script"; OMP_NUM_THREADS=1 $(BIN)/python "$$script"; fi; done
+
+bench-peers: $(STAMP)  ## steps/s of other projects' environments beside ours; fetches them into build/peers first
+	$(BIN)/python bench/peers.py
+
+docs: $(STAMP)  ## docs/environment.md, written anew from the code
+	$(BIN)/python -m vid2demo.envs.docs_page
 
 lock: $(STAMP)  ## requirements.lock from pyproject.toml, names and versions only (UPGRADE=1: newest versions)
 	$(BIN)/uv pip compile pyproject.toml --all-extras --python $(BIN)/python --quiet $(if $(UPGRADE),--upgrade) \

@@ -4,7 +4,8 @@
 
 Every peer gets a virtual environment of its own under build/peers/ (made by uv on the first call, which takes minutes
 and needs a package index), because they want other versions of MuJoCo than we do. Each environment runs in a process
-of its own with state observations and random actions; only `env.step` is timed.
+of its own with state observations and random actions; only `env.step` is timed. Random actions soon spill our
+particles, and what lies apart costs less than what is poured: `bench/env_speed.py` times the pour itself.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ ALL = {
     OURS: Peer(
         "vid2demo",
         (
-            ("PandaPour-v0", {"num_particles": 0}),
+            ("PandaTrack-v0", {}),
             ("PandaPour-v0", {"num_particles": 50}),
             ("PandaPour-v0", {"num_particles": 100}),
         ),
