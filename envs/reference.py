@@ -38,9 +38,9 @@ class Reference:
     twist_world: (N, 6) velocity of the object's origin in m/s, then angular velocity in rad/s, both in world axes.
     confidence: (N,) in [0, 1], how sure the tracker was; ones by default.
     video_time_s: (N,) the video's clock at each knot, not decreasing (a hold repeats it); `time_s` by default.
-    header: JSON-like; `symmetry`, `vessel` ({"library": {category, params}} or {"file", "unit"}), `receptacle` (the
-        same and `T_world_receptacle`), `T_hand_object` (4x4, object in `panda_hand_tcp`), `q_start_rad` (7), `scale`,
-        `time_stretch`, `T_world_camera`, `notes` (list of sentences), `feasibility`.
+    header: JSON-like; `symmetry`, `vessel` ({"library": {category, params}} or {"file", "unit", "up", ...}),
+        `receptacle` (the same and `T_world_receptacle`), `T_hand_object` (4x4, object in `panda_hand_tcp`),
+        `q_start_rad` (7), `scale`, `time_stretch`, `T_world_camera`, `notes` (list of sentences), `feasibility`.
     """
 
     T_world_object: Array
@@ -259,23 +259,18 @@ class Reference:
 
 
 def vessel_to_header(vessel: Vessel) -> dict[str, Any]:
-    """The header entry from which `vessel_from_header` rebuilds a library vessel exactly."""
+    """The header entry from which `vessel_from_header` rebuilds a vessel exactly."""
+    if (source := vessel.source) is not None:
+        kept = ("file", "sha256", "unit", "up", "open_top")
+        return {name: getattr(source, name) for name in kept}
     return {"library": {"category": vessel.category, "params": {k: float(v) for k, v in vessel.params.items()}}}
 
 
 def vessel_from_header(entry: Mapping[str, Any], role: str) -> Vessel:
     """Rebuild a vessel from a track's `mesh` or a reference's `vessel` entry. `role` names it in errors."""
-    from ..extract.vessels import make_vessel
+    from ..extract.any_vessel import vessel_of_entry
 
-    if "library" in entry:
-        library = entry["library"]
-        return make_vessel(str(library["category"]), None, **{k: float(v) for k, v in library["params"].items()})
-    if "file" in entry:
-        raise UserError(
-            f"the {role} is the mesh file {entry['file']}, which has no known interior or grasp; "
-            "name a library vessel of like shape with --object (`vid2demo meshes list` shows them)"
-        )
-    raise UserError(f"the {role} names neither a library vessel nor a mesh file; build it with `vid2demo retarget`")
+    return vessel_of_entry(entry, role)
 
 
 def minimum_jerk(phase: Array) -> Array:

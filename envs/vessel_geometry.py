@@ -17,9 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..extract.geometry import Array
+from ..extract.vessel_types import polygon_areas, support_polygons
 
 if TYPE_CHECKING:
-    from ..extract.vessels import Vessel
+    from ..extract.vessels import Profile, Vessel
 
 MAX_FRUSTA = 4
 PROFILE_TOLERANCE_M = 0.0004
@@ -194,7 +195,7 @@ class Cavity:
         support = self.support_m[level]
         round_ = bool(np.ptp(support) < 0.05 * support.max())
         n = len(support)
-        half_x, half_y = support[0] + STANDING_WALL_M, support[n // 4] + STANDING_WALL_M
+        half_x, half_y = (max(support[k], support[k + n // 2]) + STANDING_WALL_M for k in (0, n // 4))
         z = self.z_m[level] + (PLATE_M if above else -PLATE_M) / 2
         return Box(np.array([*self.axis_xy_m, z]), np.eye(3), np.array([half_x, half_y, PLATE_M / 2]), round_)
 
@@ -209,21 +210,48 @@ class Cavity:
 def cavity_of(vessel: Vessel) -> Cavity:
     """The hollow of a vessel, with few frusta of 12 (16 if wide) sides and the true section areas."""
     profile = vessel.interior
-    z = profile.z_m[_levels(np.column_stack([profile.z_m, profile.radius_m]))]
+    mean_m = _mean_radii(profile)
+    z = profile.z_m[_levels(np.column_stack([profile.z_m, mean_m]))]
     if z[-1] - z[-2] > 2 * RIM_BAND_M:
         z = np.insert(z, -1, z[-1] - RIM_BAND_M)
-    corner = np.interp(z, profile.z_m, profile.corner)
-    r = _fitted_radii(profile.z_m, profile.radius_m, z)
+    r = _fitted(profile.z_m, mean_m, mean_m[:, None], z)[:, 0]
     n = 16 if r.max() > WIDE_RADIUS_M else 12
     angle = 2 * np.pi * np.arange(n) / n
     normals = np.column_stack([np.cos(angle), np.sin(angle)])
     normals[np.abs(normals) < 1e-12] = 0.0
+    if profile.support_m is not None:
+        return Cavity(z, _any_supports(profile, mean_m, z, n), normals, np.asarray(profile.axis_xy_m, float))
+    corner = np.interp(z, profile.z_m, profile.corner)
     half = r[:, None] * np.array([1.0, profile.aspect])
     rho = corner * r * min(1.0, profile.aspect)
     # Corner arcs become polygon edges at the distance that keeps the area of the arc's disc.
     equal_area = math.sqrt(math.pi / (n * math.tan(math.pi / n)))
     support = (half - rho[:, None]) @ np.abs(normals).T + equal_area * rho[:, None]
     return Cavity(np.asarray(z, float), support, normals, np.asarray(profile.axis_xy_m, float))
+
+
+def _mean_radii(profile: Profile) -> Array:
+    """(K,) one radius for each section: its half extent, or that of the circle of its area if it has any shape."""
+    if profile.support_m is None:
+        return np.asarray(profile.radius_m)
+    return np.asarray(np.sqrt(polygon_areas(support_polygons(profile.support_m)) / math.pi))
+
+
+def _any_supports(profile: Profile, mean_m: Array, z: Array, n: int) -> Array:
+    """(L, n) supports at levels `z` of sections of any shape, from the finer ones of a profile."""
+    assert profile.support_m is not None
+    fine = profile.support_m
+    which = 2 * np.pi * np.arange(n) / n
+    known = 2 * np.pi * np.arange(fine.shape[1] + 1) / fine.shape[1]
+    coarse = np.stack([np.interp(which, known, np.append(row, row[0])) for row in fine])
+    # Fewer edges stand around a larger polygon: all are drawn in alike until the areas agree.
+    around = polygon_areas(support_polygons(coarse)) / (math.pi * mean_m**2)
+    support = _fitted(profile.z_m, mean_m, coarse / np.sqrt(around)[:, None], z)
+    for _ in range(3):
+        # An edge that stands beyond where its neighbours meet would have less than no length.
+        limit = (np.roll(support, 1, axis=1) + np.roll(support, -1, axis=1)) / (2 * math.cos(2 * math.pi / n))
+        support = np.minimum(support, limit)
+    return support
 
 
 def _levels(profile: Array) -> NDArray[np.int64]:
@@ -252,15 +280,16 @@ def _overlap_m(bend_rad: float, wall_m: float) -> float:
     return min(OVERLAP_M, INTRUSION_M / math.sin(min(-bend_rad, 1.5)))
 
 
-def _fitted_radii(z: Array, r: Array, levels: Array) -> Array:
-    """Radii at `levels` whose straight joins come nearest to the profile (z, r), in the sense of squared areas."""
+def _fitted(z: Array, weight_m: Array, values: Array, levels: Array) -> Array:
+    """(L, C) values at `levels` whose straight joins come nearest to `values` (K, C) at z, as areas count."""
     fine = np.linspace(z[0], z[-1], 400)
     hats = np.stack([np.interp(fine, levels, row) for row in np.eye(len(levels))], axis=1)
-    wanted = np.interp(fine, z, r)
-    weight = np.sqrt(wanted)[:, None]
-    fitted = np.linalg.lstsq(hats * weight, wanted * weight[:, 0], rcond=None)[0]
+    wanted = np.stack([np.interp(fine, z, column) for column in values.T], axis=1)
+    weight = np.sqrt(np.interp(fine, z, weight_m))[:, None]
+    fitted = np.linalg.lstsq(hats * weight, wanted * weight, rcond=None)[0]
     # Narrow floors (a bowl's) must not be fitted away.
-    return np.asarray(np.maximum(fitted, 0.25 * np.interp(levels, z, r)))
+    floor = np.stack([np.interp(levels, z, column) for column in values.T], axis=1)
+    return np.asarray(np.maximum(fitted, 0.25 * floor))
 
 
 def collision_boxes(vessel: Vessel, cavity: Cavity, wall_m: float = SWUNG_WALL_M) -> list[Box]:
@@ -274,10 +303,13 @@ def collision_boxes(vessel: Vessel, cavity: Cavity, wall_m: float = SWUNG_WALL_M
 
 def visual_parts(mesh: Any, max_faces: int = 3000) -> list[tuple[tuple[float, ...], Array, NDArray[np.int64]]]:
     """(rgba, vertices (V, 3), faces (F, 3)) for each colour of a trimesh, decimated to about `max_faces` in all."""
-    colors = np.asarray(mesh.visual.face_colors)
+    colors = np.ascontiguousarray(mesh.visual.face_colors, np.uint8)
+    # Four bytes as one number: sorting rows takes ten times as long.
+    packed = colors.view(np.uint32)[:, 0]
     parts = []
-    for color in np.unique(colors, axis=0):
-        part = mesh.submesh([np.flatnonzero(np.all(colors == color, axis=1))], append=True, repair=False)
+    for value in np.unique(packed):
+        color = np.array([value]).view(np.uint8)
+        part = mesh.submesh([np.flatnonzero(packed == value)], append=True, repair=False)
         keep = math.ceil(max_faces * len(part.faces) / len(mesh.faces))
         if keep < len(part.faces) and keep > 50:
             part = part.simplify_quadric_decimation(face_count=keep)

@@ -1,4 +1,4 @@
-"""What a vessel of the library is made of: its walls as profiles, its outlet, where to hold it.
+"""What a vessel is made of: its walls as profiles, its outlet, where to hold it.
 
 Everything is in the vessel's own frame: metres, origin at the centre of the bounding box, +z up, +x toward the
 spout, the lip or the side opposite the handle.
@@ -68,6 +68,23 @@ def section_outlines(radius_m: Array, corner: Array, aspect: float, segments: in
     return np.asarray(signs * (half[:, None, :] - rho_m) + rho_m * arc)
 
 
+def support_polygons(support_m: Array) -> Array:
+    """(K, n, 2) corners of the polygons whose edges stand at distances (K, n) in the directions 2 pi k / n."""
+    step = 2 * math.pi / support_m.shape[1]
+    angle = step * np.arange(support_m.shape[1])
+    normals = np.column_stack([np.cos(angle), np.sin(angle)])
+    along = (np.roll(support_m, -1, axis=1) - support_m * math.cos(step)) / math.sin(step)
+    return np.asarray(
+        support_m[..., None] * normals + along[..., None] * (normals @ np.array([[0.0, 1.0], [-1.0, 0.0]]))
+    )
+
+
+def polygon_areas(points_m: Array) -> Array:
+    """(K,) areas of polygons (K, n, 2), counter-clockwise ones positive."""
+    x, y = points_m[..., 0], points_m[..., 1]
+    return np.asarray(0.5 * np.sum(x * np.roll(y, -1, axis=-1) - y * np.roll(x, -1, axis=-1), axis=-1))
+
+
 @dataclass(frozen=True)
 class Profile:
     """One surface of a vessel's wall: cross-sections stacked along a vertical axis, linear in between.
@@ -77,6 +94,8 @@ class Profile:
     corner: (K,) corner ratio of the cross-section at each height, all ones for a round vessel.
     aspect: half extent along y over half extent along x.
     axis_xy_m: where the vertical axis stands.
+    support_m: for sections of any other convex shape, (K, n) how far each reaches from the axis in the directions
+        2 pi k / n, n a multiple of 4; radius, corner and aspect then only sum it up.
     """
 
     z_m: Array
@@ -84,20 +103,31 @@ class Profile:
     corner: Array
     aspect: float = 1.0
     axis_xy_m: tuple[float, float] = (0.0, 0.0)
+    support_m: Array | None = None
 
     def radius_at(self, z_m: float) -> float:
         """Half extent along x at a height, held constant beyond both ends."""
         return float(np.interp(z_m, self.z_m, self.radius_m))
 
     def outlines(self, segments: int = 64) -> Array:
-        """(K, segments, 3) polygon of the cross-section at every level, in the object frame."""
-        xy = section_outlines(self.radius_m, self.corner, self.aspect, segments) + np.asarray(self.axis_xy_m)
+        """(K, segments, 3) polygon of the cross-section at every level, in the object frame.
+
+        A section given by supports has as many corners as these.
+        """
+        if self.support_m is None:
+            xy = section_outlines(self.radius_m, self.corner, self.aspect, segments)
+        else:
+            xy = support_polygons(self.support_m)
+        xy = xy + np.asarray(self.axis_xy_m)
         z = np.broadcast_to(self.z_m[:, None, None], (*xy.shape[:2], 1))
         return np.concatenate([xy, z], axis=-1)
 
     def volume_below_m3(self, z_m: float) -> float:
         """Volume between the lowest level and height `z_m`: frusta of the true, not polygonal, cross-sections."""
         z = np.clip(self.z_m, None, z_m)
+        if self.support_m is not None:
+            root = np.interp(z, self.z_m, np.sqrt(polygon_areas(support_polygons(self.support_m))))
+            return float(np.sum(np.diff(z) * (root[:-1] ** 2 + root[:-1] * root[1:] + root[1:] ** 2)) / 3)
         r = np.interp(z, self.z_m, self.radius_m)
         rho = r * np.interp(z, self.z_m, self.corner) * min(1.0, self.aspect)
         r_a, r_b, rho_a, rho_b = r[:-1], r[1:], rho[:-1], rho[1:]
@@ -151,17 +181,37 @@ class GraspRegion:
 
 
 @dataclass(frozen=True)
-class Vessel:
-    """A vessel with walls: one watertight solid with its interior, outlet and grasps known exactly.
+class MeshSource:
+    """The file that a vessel was read from, and how.
 
-    category, params: `make_vessel(category, **params)` rebuilds it exactly.
-    mesh: trimesh.Trimesh in metres; face colours tell its parts (body, handle, lid ...) apart.
+    file: path. sha256: `meshes.mesh_sha256` of the mesh as read. unit: of the file's numbers. up: the file's axis that
+    points out of the opening, such as "+y". open_top: whether a closed mesh was cut open at its top.
+    T_file_vessel: (4, 4) pose of the vessel's frame in the file's own axes, in metres.
+    """
+
+    file: str
+    sha256: str
+    unit: str
+    up: str
+    open_top: bool
+    T_file_vessel: Array
+
+
+@dataclass(frozen=True)
+class Vessel:
+    """A vessel with walls: its interior, outlet and grasps, known exactly in the library's and measured in a mesh.
+
+    category, params: for a vessel of the library, `make_vessel(category, **params)` rebuilds it exactly; for one from
+        a mesh the nearest word for it, or "vessel", and nothing.
+    mesh: trimesh.Trimesh in metres; face colours tell its parts (body, handle, lid ...) apart. The library's are
+        watertight.
     symmetry: rotational symmetry of the outer shape.
     section: the cross-section where the body is widest.
     interior, exterior: inner and outer surface of the wall; a pulled-out pouring lip is left out of both.
     wall_m: thickness of the wall. is_open: False when a lid closes the top and only the spout pours.
     interior_volume_m3: volume from floor to rim (or lid), lip included, spout channel left out.
     mass_kg: of the empty vessel. color_rgba: of its body. extents_m: full size of its bounding box along x, y, z.
+    source: the mesh file it was read from, None for the library's.
     """
 
     category: str
@@ -179,3 +229,4 @@ class Vessel:
     mass_kg: float
     color_rgba: Color
     extents_m: Vector
+    source: MeshSource | None = None

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from vid2demo.envs.reference import Reference, interpolate_poses, minimum_jerk, twist_of, vessel_to_header
 from vid2demo.extract.errors import UserError
 from vid2demo.extract.geometry import Symmetry, make_pose
+from vid2demo.extract.vessel_output import export_vessel
 from vid2demo.extract.vessels import make_vessel
 
 
@@ -51,9 +52,23 @@ def test_vessels_are_rebuilt_exactly(tmp_path: Path) -> None:
     np.testing.assert_array_equal(back.mesh.vertices, original.mesh.vertices)
 
 
-def test_a_mesh_file_as_vessel_is_refused_with_the_mend() -> None:
-    with pytest.raises(UserError, match=r"cup\.obj.*library vessel"):
-        arc().with_header(vessel={"file": "cup.obj", "unit": "m"}).vessel()
+def test_a_mesh_file_as_vessel_is_read_again_and_missed_when_it_is_gone(tmp_path: Path) -> None:
+    jug = make_vessel("milk_jug")
+    export_vessel(jug, tmp_path / "jug.obj")
+    track_entry = {"name": "jug.obj", "file": str(tmp_path / "jug.obj"), "unit": "auto"}
+    vessel = arc().with_header(vessel=track_entry).vessel()
+    arc().with_header(vessel=vessel_to_header(vessel)).save(tmp_path / "pour.reference.npz")
+    again = Reference.load(tmp_path / "pour.reference.npz").vessel()
+    assert again.source is not None
+    assert again.source.up == "+z"
+    np.testing.assert_array_equal(again.mesh.vertices, vessel.mesh.vertices)
+    assert again.interior_volume_m3 == pytest.approx(jug.interior_volume_m3, rel=0.02)
+    export_vessel(make_vessel("milk_jug", 1), tmp_path / "jug.obj")
+    with pytest.raises(UserError, match=r"jug\.obj.*has changed"):
+        Reference.load(tmp_path / "pour.reference.npz").vessel()
+    (tmp_path / "jug.obj").unlink()
+    with pytest.raises(UserError, match=r"held vessel is the mesh file .*jug\.obj, which does not exist"):
+        Reference.load(tmp_path / "pour.reference.npz").vessel()
 
 
 def test_what_is_missing_is_named() -> None:
