@@ -28,6 +28,8 @@ SLACK_RADII = 0.2
 ARRIVED_RADII, MAX_STRIDES = 0.02, 8
 # Overlaps are undone no faster than this, or the particles would be shot apart.
 PAIR_RECOVERY_M_S, WALL_RECOVERY_M_S = 0.1, 0.2
+# Part of an overlap that one sweep undoes: the engine's contacts give way as much, and a jet leaves a lip as fast.
+PAIR_STIFFNESS = 0.7
 MAX_PAIRS, MAX_CONTACTS = 24, 12  # each particle
 CONTACT_WIDTH = 11
 
@@ -288,7 +290,7 @@ def project_pairs(x: Array, last: Array, pairs: Ints, count: int, radius_m: floa
             dx, dy, dz, distance = 0.0, 0.0, 1e-9, 1e-9
         ox, oy, oz = last[i, 0] - last[j, 0], last[i, 1] - last[j, 1], last[i, 2] - last[j, 2]
         old = touch - math.sqrt(ox * ox + oy * oy + oz * oz)
-        depth = touch - distance - max(0.0, old - PAIR_RECOVERY_M_S * h)
+        depth = PAIR_STIFFNESS * (touch - distance - max(0.0, old - PAIR_RECOVERY_M_S * h))
         if depth <= 0.0:
             continue
         nx, ny, nz = dx / distance, dy / distance, dz / distance
