@@ -13,17 +13,18 @@ if TYPE_CHECKING:
     from .dm_adapter import as_dm_env
     from .liquid import Liquid
     from .options import Termination
-    from .pouring import PandaPourEnv, PandaTrackEnv
+    from .pouring import PandaPourEnv
     from .randomization import Randomization
     from .reference import Reference
     from .rewards import RewardConfig
     from .start import ReferenceStart
+    from .tracking import PandaTrackEnv
 
 _HOMES = {
     "CameraPose": "cameras",
     "Liquid": "liquid",
     "PandaPourEnv": "pouring",
-    "PandaTrackEnv": "pouring",
+    "PandaTrackEnv": "tracking",
     "Randomization": "randomization",
     "Reference": "reference",
     "ReferenceStart": "start",

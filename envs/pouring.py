@@ -1,4 +1,4 @@
-"""`PandaPour-v0` and `PandaTrack-v0`: a Panda holds a vessel and must move it as the reference does.
+"""`PandaPour-v0`: a Panda holds a vessel full of particles and must pour as the reference does.
 
 The world frame is the robot's base, z up, table top at z = 0. A step lasts one control period; the action given at step
 k is reached at its end, when the object should be at knot k + 1 of the reference.
@@ -53,9 +53,8 @@ from .rewards import (
     with_tolerance,
 )
 from .simulation import Simulation
-from .stage import Stage
+from .stage import Stages
 from .start import STARTS, ReferenceStart, StartSampler
-from .substitution import with_receptacle
 
 if TYPE_CHECKING:
     from ..extract.vessels import Vessel
@@ -64,18 +63,6 @@ if TYPE_CHECKING:
 _Q_MIN_RAD, _Q_MAX_RAD = Q_MIN_RAD.tolist(), Q_MAX_RAD.tolist()
 TRACKED_M, TRACKED_RAD = 0.05, 0.3
 _OPTIONS = ("state", "start_offset_m", "receptacle_offset_m", "start_index")
-_STATE = (
-    "simulation",
-    "target",
-    "rate",
-    "step",
-    "worst_m",
-    "worst_rad",
-    "tolerance",
-    "draw",
-    "failure_rate",
-    "generator",
-)
 
 Observation = dict[str, Any]
 Info = dict[str, Any]
@@ -147,7 +134,7 @@ class PandaPourEnv(gym.Env[Observation, NDArray[np.float32]]):
         check_number("success_poured_fraction", success_poured_fraction, 0.0, 1.0)
         check_number("success_spilled_fraction", success_spilled_fraction, 0.0, 1.0)
         check_number("tolerance", tolerance, 1e-3, 1e3)
-        self.cameras, self._own_cameras = check_cameras(cameras, render_camera)
+        self.cameras, own_cameras = check_cameras(cameras, render_camera)
         self.control_hz = float(control_hz)
         self.timestep_s, self._substeps = timing(self.control_hz, timestep_s)
         self.randomization = preset("randomization", randomization, RANDOMIZATIONS, Randomization)
@@ -169,8 +156,11 @@ class PandaPourEnv(gym.Env[Observation, NDArray[np.float32]]):
         self._liquid: Liquid = preset("liquid", {} if liquid is None else liquid, {}, Liquid)
         self._base = load_reference(reference, self.control_hz, vessel, receptacle)
         self._control = Control(control_mode, self.control_hz, self._substeps)
-        self._stages: dict[int, Stage] = {}
-        self._stage = self._stage_for(-1)
+        actuation, step_s = self._control.actuation, self.timestep_s
+        self._stages = Stages(
+            self._base, self._num_particles, self._liquid, step_s, self._substeps, actuation, self.grasp, own_cameras
+        )
+        self._stage = self._stages.get(-1)
         scene = self.simulation.scene
         self._settle_steps = round(settle_s * self.control_hz)
         self._max_episode_steps = len(self._base) - 1 + self._settle_steps
@@ -257,14 +247,15 @@ class PandaPourEnv(gym.Env[Observation, NDArray[np.float32]]):
         """(H, W, 3) uint8 picture of `render_camera`; None without a render mode, or when it went to the window."""
         hud = Hud(self._step_index / self.control_hz, *self._share[1:], *self._tracking_errors[:2])
         T_world_reference = self.reference.T_world_object[self._reference_index]
-        return self._display.show(self._stage.pictures, self.data, T_world_reference, hud)
+        unmodelled = self.simulation.unmodelled_particles
+        return self._display.show(self._stage.pictures, self.data, T_world_reference, hud, unmodelled)
 
     def close(self) -> None:
         """Free the rendering contexts and close the window."""
         if hasattr(self, "_display"):
             self._display.close()
-        for stage in getattr(self, "_stages", {}).values():
-            stage.pictures.close()
+        if hasattr(self, "_stages"):
+            self._stages.close()
 
     # ------------------------------------------------------------------ state
 
@@ -285,10 +276,10 @@ class PandaPourEnv(gym.Env[Observation, NDArray[np.float32]]):
 
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Continue exactly where `get_state()` was called, in this or an equal environment."""
-        if missing := [name for name in _STATE if name not in state]:
+        if missing := [name for name in self.get_state() if name not in state]:
             raise UserError(f"the state lacks {', '.join(missing)}; take it from get_state()")
         self._draw = Draw.from_state(state["draw"])
-        self._stage = self._stage_for(self._draw.receptacle_shape)
+        self._stage = self._stages.get(self._draw.receptacle_shape)
         self._stage.take(self._draw)
         self.simulation.set_state(state["simulation"])
         self._control.state = ControlState(np.array(state["target"], float), np.array(state["rate"], float))
@@ -379,30 +370,9 @@ class PandaPourEnv(gym.Env[Observation, NDArray[np.float32]]):
 
     # ------------------------------------------------------------------ inside
 
-    def _stage_for(self, shape: int) -> Stage:
-        """The stage with the receptacle's seeded shape, or its own for -1; built when first needed."""
-        if shape not in self._stages:
-            reference = self._base
-            if shape >= 0:
-                from ..extract.vessels import make_vessel
-
-                reference = with_receptacle(reference, make_vessel(reference.receptacle().category, shape))
-            self._stages[shape] = Stage(
-                reference,
-                self._num_particles,
-                self._liquid,
-                self.timestep_s,
-                self._substeps,
-                self._control.actuation,
-                self.grasp,
-                self._own_cameras,
-                self._stages.get(-1),
-            )
-        return self._stages[shape]
-
     def _begin(self, draw: Draw, index: int) -> None:
         self._draw, self._step_index = draw, index
-        self._stage = self._stage_for(draw.receptacle_shape)
+        self._stage = self._stages.get(draw.receptacle_shape)
         target, rate = self._stage.begin(draw, index)
         self._control.reset(target, rate)
         self._worst_m, self._worst_rad = 0.0, 0.0
@@ -446,7 +416,9 @@ class PandaPourEnv(gym.Env[Observation, NDArray[np.float32]]):
             )
         if self.obs_mode != "state":
             observation["pixels"] = {
-                camera: self._stage.pictures.picture(simulation.data, camera, self.image_size)
+                camera: self._stage.pictures.picture(
+                    simulation.data, camera, self.image_size, simulation.unmodelled_particles
+                )
                 for camera in self.cameras
             }
         return observation
@@ -472,23 +444,3 @@ class PandaPourEnv(gym.Env[Observation, NDArray[np.float32]]):
             lost = scene.num_particles - self.simulation.settled_held
             info["start_warning"] = f"{lost} particles run out in the start pose: the vessel is tilted or too full"
         return info
-
-
-class PandaTrackEnv(PandaPourEnv):
-    """The same without liquid: follow the reference, as fast as the arm alone can be simulated.
-
-    Takes `PandaPourEnv`'s arguments but `num_particles` and `liquid`. The reward is for tracking alone, an episode
-    that has lost the object ends, and success is to have stayed within 5 cm and 0.3 rad to the end.
-    """
-
-    def __init__(
-        self,
-        reference: Reference | Path | str | None = None,
-        *,
-        reward_mode: str | RewardConfig | Mapping[str, Any] = "tracking",
-        termination: str | Termination | Mapping[str, Any] = "lost",
-        **arguments: Any,
-    ) -> None:
-        if forbidden := sorted({"num_particles", "liquid"} & set(arguments)):
-            raise UserError(f"PandaTrack-v0 has no liquid, so no {' and '.join(forbidden)}; make PandaPour-v0 for that")
-        super().__init__(reference, 0, reward_mode=reward_mode, termination=termination, **arguments)

@@ -10,6 +10,6 @@ def register_envs() -> None:
     except ModuleNotFoundError:  # the extract package is usable on its own
         return
 
-    for task in ("Pour", "Track"):
+    for task, module in (("Pour", "pouring"), ("Track", "tracking")):
         if f"Panda{task}-v0" not in registry:
-            register(id=f"Panda{task}-v0", entry_point=f"vid2demo.envs.pouring:Panda{task}Env")
+            register(id=f"Panda{task}-v0", entry_point=f"vid2demo.envs.{module}:Panda{task}Env")

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 VESSEL_BODY, RECEPTACLE_BODY = "vessel", "receptacle"
 TABLE_CENTER_XY_M, TABLE_HALF_M, TABLE_THICKNESS_M = (0.35, 0.0), (0.75, 0.75), 0.04
-FLOOR_Z_M = -0.72
+FLOOR_Z_M, FLOOR_THICKNESS_M = -0.72, 0.2
 MAX_PICTURE_PX = 1920
 WATER_RGBA = [0.42, 0.78, 0.98, 1.0]
 # The hull of the held vessel ends this much inside its surface: one that stands on the table is not pushed.
@@ -111,7 +111,8 @@ def build_scene(
     _add_vessel(spec, standing, receptacle, standing_boxes, vessel_contact)
     _add_pedestal(spec, standing, receptacle, T_world_receptacle, vessel_contact)
     particle_contact = {**contact, "contype": CONTACT_PARTICLE, "conaffinity": CONTACT_PARTICLE | CONTACT_VESSEL}
-    add_particles(spec, num_particles, radius_m, liquid, particle_contact, WATER_RGBA)
+    if liquid.solver == "engine":
+        add_particles(spec, num_particles, radius_m, liquid, particle_contact, WATER_RGBA)
     add_cameras(spec, reference, vessel, T_world_receptacle, cameras)
     model = spec.compile()
     return Scene(
@@ -126,6 +127,25 @@ def build_scene(
         radius_m,
         liquid,
     )
+
+
+def particle_obstacles(model: mujoco.MjModel, body: str) -> list[Box]:
+    """What particles bounce off of a body (`VESSEL_BODY`, `RECEPTACLE_BODY` or "world"), in the body's frame."""
+    boxes = []
+    for i in np.flatnonzero(model.geom_bodyid == model.body(body).id):
+        if not (model.geom_contype[i] & CONTACT_VESSEL or model.geom_conaffinity[i] & CONTACT_PARTICLE):
+            continue
+        R = Rotation.from_quat(model.geom_quat[i], scalar_first=True).as_matrix()
+        size, center = model.geom_size[i].copy(), model.geom_pos[i].copy()
+        kind = int(model.geom_type[i])
+        if kind == int(mujoco.mjtGeom.mjGEOM_CYLINDER):
+            size[:] = size[0], size[0], size[1]
+        elif kind == int(mujoco.mjtGeom.mjGEOM_PLANE):
+            # As thick as it takes for nothing to fall through it.
+            size[2] = FLOOR_THICKNESS_M / 2
+            center -= R[:, 2] * size[2]
+        boxes.append(Box(center, R, size, kind == int(mujoco.mjtGeom.mjGEOM_CYLINDER)))
+    return boxes
 
 
 def wxyz(R: Array) -> list[float]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import mujoco
 import numpy as np
@@ -23,7 +23,10 @@ from .kernels import sort_particles, vessel_twist
 from .liquid import Liquid, SpoutConduit, fill_positions, level_share
 from .panda import ARM_JOINTS, FINGER_JOINTS
 from .reference import Reference
-from .scene import RECEPTACLE_BODY, VESSEL_BODY, Scene, build_scene
+from .scene import RECEPTACLE_BODY, VESSEL_BODY, Scene, build_scene, particle_obstacles
+
+if TYPE_CHECKING:
+    from .fast_liquid import FastLiquid
 
 # The spout's conduit looks at the particles every so many physics steps.
 CONDUIT_STRIDE = 2
@@ -34,10 +37,16 @@ ARM = 7
 
 @dataclass(frozen=True)
 class Motion:
-    """Positions and velocities in the engine's order, the vessel's poses (4, 4) and where the particles (N,) were."""
+    """A state apart from where in the world it is.
 
-    qpos: Array
-    qvel: Array
+    robot_qpos, robot_qvel: of arm, fingers and a free vessel, in the engine's order. particles_m,
+    particle_velocities_m_s: (N, 3). T_world_vessel, T_hand_object: (4, 4). where: (N,) the particles' places.
+    """
+
+    robot_qpos: Array
+    robot_qvel: Array
+    particles_m: Array
+    particle_velocities_m_s: Array
     T_world_vessel: Array
     T_hand_object: Array
     where: NDArray[np.uint8]
@@ -85,7 +94,7 @@ class Simulation:
         """Rest in a posture (7,), the particles settled in the vessel, the receptacle at `receptacle_m` (3,)."""
         self.place_receptacle(receptacle_m)
         self._pose_arm(q_rad)
-        self.particles_m[:] = self.settled_m @ self.vessel_R.T + self.vessel_m
+        self._place(self.settled_m @ self.vessel_R.T + self.vessel_m)
         self.refresh()
 
     def place_receptacle(self, position_m: Array) -> None:
@@ -95,6 +104,9 @@ class Simulation:
     def advance(self, commands: Iterable[Array]) -> None:
         """One physics step for each of the commands (7,) to the arm."""
         data, model, control, step, conduit = self.data, self.model, self.data.ctrl, mujoco.mj_step, self._conduit
+        if self._fast is not None:
+            self._advance_fast(commands, self._fast)
+            return
         if conduit is None:
             for command in commands:
                 control[:ARM] = command
@@ -106,6 +118,24 @@ class Simulation:
             if i % CONDUIT_STRIDE == 0 and conduit.may_flow(self.T_world_vessel, self.particles_m):
                 self._read_twist()
                 conduit.move(self.particles_m, self.particle_velocities_m_s, self.T_world_vessel, self.twist)
+
+    def _advance_fast(self, commands: Iterable[Array], liquid: FastLiquid) -> None:
+        data, model, conduit = self.data, self.model, self._conduit
+        push = data.xfrc_applied[self._vessel_id]
+        center_m = data.xipos[self._vessel_id]
+        T_receptacle, T_after = self.T_world_receptacle, self.T_world_vessel
+        for i, command in enumerate(commands):
+            data.ctrl[:ARM] = command
+            mujoco.mj_step(model, data)
+            mujoco.mj_kinematics(model, data)
+            T_before, T_after = T_after, self.T_world_vessel
+            fx, fy, fz, tx, ty, tz = liquid.step(T_before, T_after, T_receptacle).tolist()
+            # The engine takes forces at the centre of mass.
+            x, y, z = (self.vessel_m - center_m).tolist()
+            push[:] = fx, fy, fz, tx + y * fz - z * fy, ty + z * fx - x * fz, tz + x * fy - y * fx
+            if conduit is not None and i % CONDUIT_STRIDE == 0 and conduit.may_flow(T_after, self.particles_m):
+                self._read_twist()
+                conduit.move(self.particles_m, self.particle_velocities_m_s, T_after, self.twist)
 
     def refresh(self) -> None:
         """Bring all that is derived up to the state; after a restored state it is what it was before."""
@@ -140,7 +170,13 @@ class Simulation:
     @property
     def is_finite(self) -> bool:
         """Whether the physics still makes sense."""
-        return bool(np.isfinite(self.data.qpos).all() and np.isfinite(self.data.qvel).all())
+        robot = np.isfinite(self.data.qpos).all() and np.isfinite(self.data.qvel).all()
+        return bool(robot and (self._fast is None or np.isfinite(self.particles_m).all()))
+
+    @property
+    def unmodelled_particles(self) -> tuple[Array, float] | None:
+        """Positions (N, 3) and radius in m of particles that the engine does not know, and so does not draw."""
+        return None if self._fast is None else (self.particles_m, self.scene.radius_m)
 
     # ------------------------------------------------------------------ state
 
@@ -148,12 +184,13 @@ class Simulation:
         """All that the motion depends on, as copies."""
         physics = np.empty(mujoco.mj_stateSize(self.model, _PHYSICS))
         mujoco.mj_getState(self.model, self.data, physics, _PHYSICS)
-        return {"physics": physics, "receptacle_m": self.receptacle_m.copy()}
+        liquid = {} if self._fast is None else {"liquid": self._fast.get_state()}
+        return {"physics": physics, "receptacle_m": self.receptacle_m.copy(), **liquid}
 
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Continue from `get_state()` of this or an equal simulation. Raises UserError for one of another kind."""
         physics, size = np.asarray(state["physics"], np.float64), mujoco.mj_stateSize(self.model, _PHYSICS)
-        if physics.shape != (size,):
+        if physics.shape != (size,) or ("liquid" in state) != (self._fast is not None):
             raise UserError(
                 f"the state holds {physics.size} physics values, this environment has {size}; "
                 "it was taken with other arguments"
@@ -161,19 +198,29 @@ class Simulation:
         self.place_receptacle(np.asarray(state["receptacle_m"], np.float64))
         mujoco.mj_resetData(self.model, self.data)
         mujoco.mj_setState(self.model, self.data, physics, _PHYSICS)
+        if self._fast is not None:
+            self._fast.set_state(np.asarray(state["liquid"], np.float64))
         self.refresh()
 
     def get_motion(self) -> Motion:
-        """Positions and velocities alone, from which `set_motion` continues elsewhere in the world."""
-        qpos, qvel = self.data.qpos.copy(), self.data.qvel.copy()
-        return Motion(qpos, qvel, self.T_world_vessel, self.holding.T_hand_object, self.where.copy())
+        """What there is, as copies, for `set_motion` to continue from elsewhere in the world."""
+        return Motion(
+            self.data.qpos[: self._first_particle].copy(),
+            self.data.qvel[: self._first_velocity].copy(),
+            self.particles_m.copy(),
+            self.particle_velocities_m_s.copy(),
+            self.T_world_vessel,
+            self.holding.T_hand_object,
+            self.where.copy(),
+        )
 
     def set_motion(self, motion: Motion, q_rad: Array) -> None:
         """Take over a motion with the arm at `q_rad` (7,); the particles stay where they are in the world."""
         self._pose_arm(q_rad, motion.T_hand_object)
-        for part in (slice(ARM, ARM + 2), slice(self._first_particle, None)):
-            self.data.qpos[part] = motion.qpos[part]
-        self.data.qvel[:] = motion.qvel
+        self.data.qpos[ARM : ARM + 2] = motion.robot_qpos[ARM : ARM + 2]
+        self.data.qvel[: self._first_velocity] = motion.robot_qvel
+        self._place(motion.particles_m)
+        self.particle_velocities_m_s[:] = motion.particle_velocities_m_s
         mujoco.mj_kinematics(self.model, self.data)
 
     # ------------------------------------------------------------------ inside
@@ -182,15 +229,19 @@ class Simulation:
         model, data, scene = self.model, self.data, self.scene
         arm = [int(model.joint(name).qposadr[0]) for name in (*ARM_JOINTS, *FINGER_JOINTS)]
         self.holding = Holding(model, data, scene.vessel, reference.T_hand_object)
-        self._first_particle = 9 + self.holding.positions
-        if arm != list(range(9)) or model.nq != self._first_particle + 3 * scene.num_particles:
+        self._first_particle, self._first_velocity = 9 + self.holding.positions, 9 + self.holding.velocities
+        fast = scene.liquid.solver == "fast" and scene.num_particles > 0
+        if arm != list(range(9)) or model.nq != self._first_particle + (0 if fast else 3 * scene.num_particles):
             raise RuntimeError("the scene's joints are not in the order arm, fingers, free vessel, particles")
-        vessel_id, self._receptacle_id = int(model.body(VESSEL_BODY).id), int(model.body(RECEPTACLE_BODY).id)
+        self._vessel_id, self._receptacle_id = int(model.body(VESSEL_BODY).id), int(model.body(RECEPTACLE_BODY).id)
         # Views into the engine's memory: always the pose of the last kinematics.
-        self.vessel_m, self.vessel_R = data.xpos[vessel_id], data.xmat[vessel_id].reshape(3, 3)
+        self.vessel_m, self.vessel_R = data.xpos[self._vessel_id], data.xmat[self._vessel_id].reshape(3, 3)
         self._axes, self._anchors_m, self._rates = data.xaxis[:ARM], data.xanchor[:ARM], data.qvel[:ARM]
-        self.particles_m = data.qpos[self._first_particle :].reshape(-1, 3)
-        self.particle_velocities_m_s = data.qvel[9 + self.holding.velocities :].reshape(-1, 3)
+        self._fast = self._make_fast() if fast else None
+        self.particles_m: Array = data.qpos[self._first_particle :].reshape(-1, 3)
+        self.particle_velocities_m_s: Array = data.qvel[self._first_velocity :].reshape(-1, 3)
+        if self._fast is not None:
+            self.particles_m, self.particle_velocities_m_s = self._fast.positions_m, self._fast.velocities_m_s
         self.twist: Array = np.zeros(6)
         self._robot_contacts = RobotContacts(model)
         self.where: NDArray[np.uint8] = np.zeros(scene.num_particles, np.uint8)
@@ -199,6 +250,20 @@ class Simulation:
         self.receptacle_R: Array = scene.T_world_receptacle[:3, :3].copy()
         self._vessel_hollow, self._receptacle_hollow = scene.vessel_cavity.arrays, scene.receptacle_cavity.arrays
         self._conduit = self._make_conduit() if scene.vessel.outlet.kind == "spout" and scene.num_particles else None
+
+    def _make_fast(self) -> FastLiquid:
+        from .fast_liquid import FastLiquid
+
+        scene = self.scene
+        return FastLiquid(
+            particle_obstacles(self.model, VESSEL_BODY),
+            particle_obstacles(self.model, RECEPTACLE_BODY),
+            particle_obstacles(self.model, "world"),
+            scene.num_particles,
+            scene.radius_m,
+            scene.liquid,
+            float(self.model.opt.timestep),
+        )
 
     def _make_conduit(self) -> SpoutConduit:
         scene = self.scene
@@ -212,10 +277,14 @@ class Simulation:
             scene.vessel_cavity, scene.vessel_boxes, scene.num_particles, scene.radius_m, scene.vessel.category
         )
         self._pose_arm(q_rad)
-        self.particles_m[:] = lattice @ self.vessel_R.T + self.vessel_m
+        self._place(lattice @ self.vessel_R.T + self.vessel_m)
         with still_arm(self.model):
             self.holding.close()
-            if scene.num_particles:
+            if self._fast is not None:
+                mujoco.mj_kinematics(self.model, self.data)
+                self._place(lattice @ self.vessel_R.T + self.vessel_m)
+                self._fast.settle(self.T_world_vessel, self.T_world_receptacle, SETTLE_AT_START_S)
+            elif scene.num_particles:
                 mujoco.mj_step(self.model, self.data, round(SETTLE_AT_START_S / self.model.opt.timestep))
         self.holding.keep()
         return np.asarray((self.particles_m - self.vessel_m) @ self.vessel_R)
@@ -226,6 +295,13 @@ class Simulation:
         if self._servo:
             self.data.ctrl[:ARM] = q_rad
         self.holding.pose(T_hand_object)
+
+    def _place(self, positions_m: Array) -> None:
+        """Put the particles at (N, 3), at rest."""
+        if self._fast is not None:
+            self._fast.place(positions_m)
+        else:
+            self.particles_m[:], self.particle_velocities_m_s[:] = positions_m, 0.0
 
     def _read_twist(self) -> None:
         if self.holding.free:

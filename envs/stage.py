@@ -19,6 +19,7 @@ from .reference import Reference
 from .rendering import Cameras
 from .simulation import Simulation
 from .start import Rehearsal
+from .substitution import with_receptacle
 
 
 class Stage:
@@ -74,3 +75,39 @@ class Stage:
     def rehearsal(self) -> Rehearsal:
         """The states along the reference; played through when first asked for."""
         return Rehearsal(self.base, Simulation(*self._arguments, grasp=self._grasp, alike=self.simulation))
+
+
+class Stages:
+    """One stage for each shape of the receptacle, each built when first needed and kept."""
+
+    def __init__(
+        self,
+        reference: Reference,
+        num_particles: int,
+        liquid: Liquid,
+        timestep_s: float,
+        substeps: int,
+        actuation: Literal["servo", "torque"],
+        grasp: Grasp,
+        cameras: Sequence[CameraPose],
+    ) -> None:
+        def build(reference: Reference, alike: Stage | None = None) -> Stage:
+            return Stage(reference, num_particles, liquid, timestep_s, substeps, actuation, grasp, cameras, alike)
+
+        self._build = build
+        self._stages = {-1: build(reference)}
+
+    def get(self, shape: int) -> Stage:
+        """The stage with the receptacle's seeded shape, or with its own for -1."""
+        if shape not in self._stages:
+            from ..extract.vessels import make_vessel
+
+            own = self._stages[-1]
+            other = make_vessel(own.base.receptacle().category, shape)
+            self._stages[shape] = self._build(with_receptacle(own.base, other), own)
+        return self._stages[shape]
+
+    def close(self) -> None:
+        """Free the rendering contexts."""
+        for stage in self._stages.values():
+            stage.pictures.close()

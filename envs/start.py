@@ -98,7 +98,7 @@ class Rehearsal:
             q_moved = configuration_near(moved.T_world_object[knot], moved.T_hand_object, q_rad)
         shift_m = moved.T_world_receptacle[:3, 3] - self._reference.T_world_receptacle[:3, 3]
         simulation.place_receptacle(moved.T_world_receptacle[:3, 3])
-        simulation.set_motion(motion, motion.qpos[:7] + q_moved - q_rad)
+        simulation.set_motion(motion, motion.robot_qpos[:7] + q_moved - q_rad)
         T = simulation.T_world_vessel @ invert_pose(motion.T_world_vessel)
         left = (motion.where == POURED) | (motion.where == SPILLED)
         particles_m = simulation.particles_m

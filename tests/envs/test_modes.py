@@ -15,10 +15,11 @@ from scipy.spatial.transform import Rotation
 from vid2demo.envs.control import CONTROL_MODES, Control, action_entries
 from vid2demo.envs.kinematics import panda_chain
 from vid2demo.envs.panda import Q_HOME_RAD, TAU_MAX_NM
-from vid2demo.envs.pouring import PandaPourEnv, PandaTrackEnv
+from vid2demo.envs.pouring import PandaPourEnv
 from vid2demo.envs.reference import Reference
 from vid2demo.envs.rewards import REWARD_MODES
 from vid2demo.envs.start import ReferenceStart, StartSampler
+from vid2demo.envs.tracking import PandaTrackEnv
 from vid2demo.extract.errors import UserError
 from vid2demo.extract.vessels import make_vessel
 
