@@ -25,12 +25,14 @@ if TYPE_CHECKING:
     from ..extract.vessels import Vessel
 
 Grasp = Literal["weld", "friction"]
-# Sliding, torsional and rolling friction of rubber; the pads are wide, so they also resist turning (m).
-RUBBER = [1.0, 0.006, 0.002]
+# Sliding friction of rubber, and its resistance to turning on the spot in m: two thirds of the radius of a patch that is
+# as wide as a pad. Rolling is resisted by the several points at which pads touch.
+RUBBER = [1.0, 0.006, 0.0]
 # How far beyond the pads the vessel's true shape is kept, so that one that slips a little is still held by it.
 MARGIN_M, HULL_VERTICES = 0.003, 64
 CLOSING_S = 0.15
-_HEAVY_KG_M2 = 1e6
+# A hundred times what the arm's joints carry: more would spoil the accuracy of the contacts.
+_HEAVY_KG_M2 = 1e4
 _FINGERS = slice(JOINT_COUNT, JOINT_COUNT + 2)
 
 

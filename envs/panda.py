@@ -51,7 +51,7 @@ DAMPING_NM_S_RAD: Array = SERVO_LEAD_S * STIFFNESS_NM_RAD
 CONTACT_PARTICLE, CONTACT_VESSEL, CONTACT_ROBOT, CONTACT_HELD, CONTACT_GRIP = 1, 2, 4, 8, 16
 
 # One capsule a link: both ends of its middle line in the link's frame and its radius, in m. They were fitted to the
-# hulls of the collision meshes, stay within 2 cm of them both ways, and cost a third of what the hulls do.
+# hulls of the collision meshes, stay within 2 cm of them both ways, and cost next to nothing.
 CAPSULES_M: dict[str, tuple[tuple[float, float, float], tuple[float, float, float], float]] = {
     "panda_link0": ((-0.067, 0.0, 0.05), (0.004, 0.0, 0.05), 0.085),
     "panda_link1": ((0.0, -0.055, 0.0), (0.0, 0.0, -0.138), 0.0665),
