@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from ..extract.vessels import Vessel
 
 Grasp = Literal["weld", "friction"]
-# Sliding friction of rubber, and its resistance to turning on the spot in m: two thirds of the radius of a patch that is
-# as wide as a pad. Rolling is resisted by the several points at which pads touch.
+# Sliding friction of rubber, and its resistance to turning on the spot in m: two thirds of the radius of a patch as
+# wide as a pad. Rolling is resisted by the several points at which pads touch.
 RUBBER = [1.0, 0.006, 0.0]
 # How far beyond the pads the vessel's true shape is kept, so that one that slips a little is still held by it.
 MARGIN_M, HULL_VERTICES = 0.003, 64
