@@ -57,7 +57,7 @@ def test_one_changed_action_is_noticed(copied: Path) -> None:
     first, second = report["details"]
     assert not first["same_end"]
     assert "1 actions are not those played (first at step 40, by up to 0.001 rad)" in first["differences"][0]
-    assert any("at the end, physics differs" in words for words in first["differences"])
+    assert any("at the end, simulation.physics differs" in words for words in first["differences"])
     assert second["same_end"]
 
 
