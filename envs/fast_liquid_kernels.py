@@ -188,9 +188,10 @@ def find_contacts(
 ) -> int:
     """Planes that hold the chosen particles back from the walls on their ways from `first` to `goal`; their number.
 
-    Each way is followed in the frame of each group, where the walls stand still, up to the first touch with each shape
-    (conservative advancement): the tangent plane there is the contact, so nothing is jumped over. Rows of `contacts`:
-    the plane's normal and offset before the step and their change, and the way of its foot, in the world.
+    Each way is followed in the frame of each group, where the walls stand still, up to the first shape that it runs
+    into (conservative advancement), so nothing is jumped over. Every shape that the rest of the way might reach from
+    there gives a contact: the plane through its nearest point. Rows of `contacts`: the plane's normal and offset before
+    the step and their change, and the way of its foot, in the world.
     """
     found = 0
     room = len(which)
@@ -215,26 +216,32 @@ def find_contacts(
                     continue
                 cell = groups[g, 2] + (cx * groups[g, 4] + cy) * groups[g, 5] + cz
                 low, high = starts[cell], starts[cell + 1]
+            end = 1.0
             for place in range(low, high):
                 k = items[place] if listed else place
-                if not within(shapes, k, ax, ay, az, radius_m + way + slack):
+                if not within(shapes, k, ax, ay, az, radius_m + way + arrived):
                     continue
-                distance, nx, ny, nz = nearest(shapes, k, ax, ay, az)
-                gap = distance - radius_m
                 t = 0.0
                 for _ in range(MAX_STRIDES):
-                    if gap <= arrived or t >= 1.0:
-                        break
-                    t = min(1.0, t + gap / way)
                     distance, nx, ny, nz = nearest(shapes, k, ax + t * bx, ay + t * by, az + t * bz)
                     gap = distance - radius_m
-                if gap > slack or found == room:
+                    if gap <= arrived or t >= end:
+                        break
+                    t += gap / way
+                if t < end and nx * bx + ny * by + nz * bz < 0.0:
+                    end = t
+                    if t == 0.0:
+                        break
+            rest = (1.0 - end) * way + slack
+            ax, ay, az = ax + end * bx, ay + end * by, az + end * bz
+            for place in range(low, high):
+                k = items[place] if listed else place
+                if not within(shapes, k, ax, ay, az, radius_m + rest):
                     continue
-                px, py, pz = (
-                    ax + t * bx - distance * nx,
-                    ay + t * by - distance * ny,
-                    az + t * bz - distance * nz,
-                )
+                distance, nx, ny, nz = nearest(shapes, k, ax, ay, az)
+                if distance - radius_m > rest or found == room:
+                    continue
+                px, py, pz = ax - distance * nx, ay - distance * ny, az - distance * nz
                 ux, uy, uz = _turned(before, nx, ny, nz)
                 wx, wy, wz = _turned(after, nx, ny, nz)
                 fx, fy, fz = _outside(before, px, py, pz)
