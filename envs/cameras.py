@@ -53,7 +53,7 @@ class CameraPose:
             )
         if not isinstance(self.fovy_deg, int | float) or not MIN_FOVY_DEG <= self.fovy_deg <= MAX_FOVY_DEG:
             raise UserError(
-                f"fovy_deg of camera {self.name} is {self.fovy_deg!r}; give {MIN_FOVY_DEG:g} to {MAX_FOVY_DEG:g} degrees"
+                f"fovy_deg of camera {self.name} is {self.fovy_deg!r}; give {MIN_FOVY_DEG:g} to {MAX_FOVY_DEG:g}"
             )
         object.__setattr__(self, "T_world_camera", T)
 
@@ -90,14 +90,13 @@ def add_cameras(
     spec: mujoco.MjSpec,
     reference: Reference,
     vessel: Vessel,
-    T_world_receptacle: Array,
     own: Sequence[CameraPose] = (),
 ) -> None:
     """Cameras from which the whole motion and the receptacle can be seen, and one's own."""
     for camera in own:
         _add_camera(spec.worldbody, camera.name, camera.T_world_camera, camera.fovy_deg)
     path = reference.T_world_object[:, :3, 3]
-    points = np.vstack([path, T_world_receptacle[:3, 3]])
+    points = np.vstack([path, reference.receptacle_m]) if reference.has_receptacle else path
     low, high = points.min(0), points.max(0)
     target = (low + high) / 2
     size_m = float(np.linalg.norm(high - low)) / 2 + 0.75 * float(np.linalg.norm(vessel.extents_m))

@@ -164,7 +164,8 @@ class PandaPourEnv(gym.Env[Observation, NDArray[np.float32]]):
         scene = self.simulation.scene
         self._settle_steps = round(settle_s * self.control_hz)
         self._max_episode_steps = len(self._base) - 1 + self._settle_steps
-        self.task = f"pour from the {scene.vessel.category} into the {scene.receptacle.category}".replace("_", " ")
+        into = f"pour from the {{}} into the {scene.receptacle.category}" if scene.receptacle else "move the {}"
+        self.task = into.format(scene.vessel.category).replace("_", " ")
         self.task_description = self.task
         self.action_space = self._control.space
         self.action_names = tuple(entry.name for entry in self._control.entries)

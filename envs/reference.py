@@ -144,6 +144,11 @@ class Reference:
         self._require_receptacle()
         return np.asarray(self.header["receptacle"]["T_world_receptacle"], float).reshape(4, 4)
 
+    @property
+    def receptacle_m(self) -> Array:
+        """(3,) origin of the receptacle in the world; zeros without one."""
+        return self.T_world_receptacle[:3, 3] if self.has_receptacle else np.zeros(3)
+
     def vessel(self) -> Vessel:
         """The held vessel, rebuilt from the header. Raises UserError when the header names none."""
         return vessel_from_header(self.header.get("vessel") or {}, "held vessel")

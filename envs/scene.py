@@ -45,14 +45,15 @@ class Scene:
     """A compiled scene and what is needed to work with it.
 
     vessel_cavity, receptacle_cavity: the hollows, each in its vessel's frame. vessel_boxes: collision shapes of the
-    held vessel. T_world_receptacle: (4, 4) where the model has the receptacle. radius_m: particle radius.
+    held vessel. T_world_receptacle: (4, 4) where the model has the receptacle. radius_m: particle radius. Without a
+    receptacle what belongs to it is None, and its body is empty.
     """
 
     model: mujoco.MjModel
     vessel: Vessel
-    receptacle: Vessel
+    receptacle: Vessel | None
     vessel_cavity: Cavity
-    receptacle_cavity: Cavity
+    receptacle_cavity: Cavity | None
     vessel_boxes: list[Box]
     T_world_receptacle: Array
     num_particles: int
@@ -75,11 +76,18 @@ def build_scene(
     grasp: "weld" makes the vessel a part of the hand, "friction" a free body that the fingers hold.
     Raises UserError when the receptacle would stand in the table, or when the fingers cannot close on the vessel.
     """
-    vessel, receptacle = reference.vessel(), reference.receptacle()
-    vessel_cavity, receptacle_cavity = cavity_of(vessel), cavity_of(receptacle)
+    vessel, vessel_cavity = reference.vessel(), cavity_of(reference.vessel())
+    receptacle = reference.receptacle() if reference.has_receptacle else None
+    receptacle_cavity = None if receptacle is None else cavity_of(receptacle)
+    if num_particles and receptacle is None:
+        raise UserError(
+            f"the reference has no receptacle to pour {num_particles} particles into; choose num_particles=0 "
+            "(PandaTrack-v0), name a receptacle, or build it with `vid2demo retarget --receptacle NAME`"
+        )
     throat_m = vessel_cavity.throat_m if vessel.outlet.kind == "lip" else math.inf
-    radius_m = liquid.radius_for(num_particles, vessel_cavity.volume_m3, receptacle_cavity.volume_m3, throat_m)
-    T_world_receptacle = reference.T_world_receptacle
+    room_m3 = math.inf if receptacle_cavity is None else receptacle_cavity.volume_m3
+    radius_m = liquid.radius_for(num_particles, vessel_cavity.volume_m3, room_m3, throat_m)
+    T_world_receptacle = np.eye(4) if receptacle is None else reference.T_world_receptacle
 
     spec = panda_spec(actuation=actuation)
     spec.modelname = "vid2demo_pouring"
@@ -107,13 +115,14 @@ def build_scene(
     _add_vessel(spec, held, vessel, vessel_boxes, vessel_contact)
     _add_hull(spec, held, vessel, contact)
     standing = spec.worldbody.add_body(name=RECEPTACLE_BODY, **_placed(T_world_receptacle))
-    standing_boxes = collision_boxes(receptacle, receptacle_cavity, STANDING_WALL_M)
-    _add_vessel(spec, standing, receptacle, standing_boxes, vessel_contact)
-    _add_pedestal(spec, standing, receptacle, T_world_receptacle, vessel_contact)
+    if receptacle is not None and receptacle_cavity is not None:
+        standing_boxes = collision_boxes(receptacle, receptacle_cavity, STANDING_WALL_M)
+        _add_vessel(spec, standing, receptacle, standing_boxes, vessel_contact)
+        _add_pedestal(spec, standing, receptacle, T_world_receptacle, vessel_contact)
     particle_contact = {**contact, "contype": CONTACT_PARTICLE, "conaffinity": CONTACT_PARTICLE | CONTACT_VESSEL}
     if liquid.solver == "engine":
         add_particles(spec, num_particles, radius_m, liquid, particle_contact, WATER_RGBA)
-    add_cameras(spec, reference, vessel, T_world_receptacle, cameras)
+    add_cameras(spec, reference, vessel, cameras)
     model = spec.compile()
     return Scene(
         model,

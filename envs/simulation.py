@@ -58,8 +58,9 @@ class Simulation:
     vessel_m (3,), vessel_R (3, 3), twist (6,) [m/s, rad/s, of the vessel's origin, world axes], particles_m (N, 3),
     where (N,) and share (3,) [held, poured, spilled; see `kernels.sort_particles`] tell the state after the last
     `refresh()`; the first two and the particles are views into the engine's memory. receptacle_m, receptacle_R: pose
-    of the receptacle, which is still. settled_m: (N, 3) where the particles rest in the vessel's frame; settled_held:
-    how many of those places are in the vessel. holding: how the vessel is held, and how far it has slipped.
+    of the receptacle, which is still; at the origin without one. settled_m: (N, 3) where the particles rest in the
+    vessel's frame; settled_held: how many of those places are in the vessel. holding: how the vessel is held, and how
+    far it has slipped.
     """
 
     def __init__(
@@ -141,6 +142,8 @@ class Simulation:
         """Bring all that is derived up to the state; after a restored state it is what it was before."""
         mujoco.mj_kinematics(self.model, self.data)
         self._read_twist()
+        if self._receptacle_hollow is None:
+            return
         sort_particles(
             self.particles_m,
             self._vessel_hollow,
@@ -248,7 +251,9 @@ class Simulation:
         self.share: Array = np.zeros(3)
         self.receptacle_m: Array = scene.T_world_receptacle[:3, 3].copy()
         self.receptacle_R: Array = scene.T_world_receptacle[:3, :3].copy()
-        self._vessel_hollow, self._receptacle_hollow = scene.vessel_cavity.arrays, scene.receptacle_cavity.arrays
+        self._vessel_hollow = scene.vessel_cavity.arrays
+        receptacle = scene.receptacle_cavity if scene.num_particles else None
+        self._receptacle_hollow = None if receptacle is None else receptacle.arrays
         self._conduit = self._make_conduit() if scene.vessel.outlet.kind == "spout" and scene.num_particles else None
 
     def _make_fast(self) -> FastLiquid:

@@ -66,7 +66,7 @@ class Stage:
         self.take(draw)
         if index == 0:
             q_rad = self.reference.q_start_rad
-            self.simulation.begin(q_rad, self.reference.T_world_receptacle[:3, 3])
+            self.simulation.begin(q_rad, self.reference.receptacle_m)
             return q_rad, np.zeros(7)
         q_rad = self.rehearsal.begin(self.simulation, self.reference, index)
         return q_rad, (self.rehearsal.q_rad[index] - self.rehearsal.q_rad[index - 1]) * self.base.control_hz
@@ -98,7 +98,9 @@ class Stages:
         self._stages = {-1: build(reference)}
 
     def get(self, shape: int) -> Stage:
-        """The stage with the receptacle's seeded shape, or with its own for -1."""
+        """The stage with the receptacle's seeded shape, or with its own for -1 or when there is none."""
+        if not self._stages[-1].base.has_receptacle:
+            return self._stages[-1]
         if shape not in self._stages:
             from ..extract.vessels import make_vessel
 

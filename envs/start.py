@@ -78,7 +78,7 @@ class Rehearsal:
         self.q_rad = arm_trajectory(reference)
         control = Control("joint_position", reference.control_hz, simulation.substeps)
         control.reset(reference.q_start_rad, np.zeros(7))
-        simulation.begin(reference.q_start_rad, reference.T_world_receptacle[:3, 3])
+        simulation.begin(reference.q_start_rad, reference.receptacle_m)
         self._motions = [simulation.get_motion()]
         for q_rad in self.q_rad[1:]:
             simulation.advance(control.advance(q_rad)[0])
@@ -96,8 +96,8 @@ class Rehearsal:
         q_moved = q_rad
         if np.any(moved.T_world_object[knot] != self._reference.T_world_object[knot]):
             q_moved = configuration_near(moved.T_world_object[knot], moved.T_hand_object, q_rad)
-        shift_m = moved.T_world_receptacle[:3, 3] - self._reference.T_world_receptacle[:3, 3]
-        simulation.place_receptacle(moved.T_world_receptacle[:3, 3])
+        shift_m = moved.receptacle_m - self._reference.receptacle_m
+        simulation.place_receptacle(moved.receptacle_m)
         simulation.set_motion(motion, motion.robot_qpos[:7] + q_moved - q_rad)
         T = simulation.T_world_vessel @ invert_pose(motion.T_world_vessel)
         left = (motion.where == POURED) | (motion.where == SPILLED)

@@ -303,3 +303,21 @@ def test_ten_thousand_random_actions_leave_everything_finite(mug_pour: Reference
         assert env.observation_space.contains(observation)
         if terminated or truncated:
             env.reset()
+
+
+def test_an_object_without_a_receptacle_can_be_followed_but_not_poured(
+    mug_pour: Reference, actions_of: ActionsOf
+) -> None:
+    header = {name: value for name, value in mug_pour.header.items() if name != "receptacle"}
+    alone = Reference.from_poses(mug_pour.T_world_object, mug_pour.time_s, header)
+    env = PandaTrackEnv(alone, randomization="high", render_mode="rgb_array", render_size=(48, 64))
+    observation, _ = env.reset(seed=0)
+    assert env.observation_space.contains(observation)
+    for action in actions_of(env.reference, env._max_episode_steps):
+        _, _, _, _, info = env.step(action)
+    assert info["is_success"]
+    assert env.render().std() > 10
+    assert env.task == "move the mug"
+    assert PandaTrackEnv(mug_pour).task == "pour from the mug into the bowl"
+    with pytest.raises(UserError, match="no receptacle to pour 5 particles into"):
+        PandaPourEnv(alone, num_particles=5)

@@ -158,7 +158,7 @@ def test_own_camera_sees_a_point_where_its_pose_says(empty: PandaPourEnv) -> Non
     spec.worldbody.add_body(name="panda_hand_tcp")
     spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[3, 3, 0.1], pos=[0, 0, FLOOR_Z_M])
     spec.visual.headlight.active = True
-    add_cameras(spec, empty.reference, empty.reference.vessel(), empty.T_world_receptacle, (pose,))
+    add_cameras(spec, empty.reference, empty.reference.vessel(), (pose,))
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
