@@ -87,7 +87,7 @@ class Display:
         if self._viewer is None or self._viewer.data is not data:
             # Another geometry is another model, which a window cannot change to.
             self.close()
-            self._viewer = Viewer(cameras.model, data, self._fps)
+            self._viewer = Viewer(cameras.model, data, self._camera, self._fps)
         self._viewer.show(particles, overlay)
         return None
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import math
 import os
 import platform
 import threading
@@ -18,11 +19,13 @@ from ..extract.errors import UserError
 from ..extract.geometry import Array
 from ..extract.offscreen import load_mujoco
 from .overlays import Overlay, add_overlay, write_hud
-from .scene import WATER_RGBA
+from .scene import VESSEL_BODY, WATER_RGBA
 
 # Room in a scene for what is drawn beside the model: particles of the fast solver, ghost and trail.
 EXTRA_GEOMS = 1000
 FONT_PERCENT = 150
+# How long a closed window may take to go. New texts keep us until the window has drawn them, so they come seldom.
+CLOSING_S, TEXT_PERIOD_S = 2.0, 0.2
 Particles = tuple[Array, float]
 """Centres (N, 3) in the world and the radius, both in m, of particles that are not in the model."""
 
@@ -161,12 +164,10 @@ class _Spheres:
 
 
 class Viewer:
-    """MuJoCo's window on a running simulation; it shows the state of each call of `show`, in real time.
+    """MuJoCo's window on a running simulation; it shows the state of each call of `show`, in real time."""
 
-    Raises UserError when there is no screen to open it on.
-    """
-
-    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, fps: float) -> None:
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, camera: str, fps: float) -> None:
+        """camera: from where the window looks at first. Raises UserError when there is no screen to open it on."""
         require_screen()
         import mujoco.viewer
 
@@ -178,7 +179,9 @@ class Viewer:
                 "render_mode='rgb_array'"
             ) from error
         self._model, self.data, self._period_s, self._due_s = model, data, 1.0 / fps, time.monotonic()
-        self._spheres = _Spheres()
+        self._spheres, self._told_s = _Spheres(), -math.inf
+        with self._window.lock():
+            _look_from(self._window.cam, model, data, camera)
 
     @property
     def is_open(self) -> bool:
@@ -199,16 +202,32 @@ class Viewer:
                 self._spheres.add_to(scene, *particles)
             if overlay is not None:
                 add_overlay(scene, self._model, overlay)
-        if overlay is not None and overlay.hud is not None:
+        self._window.sync()
+        if overlay is not None and overlay.hud is not None and time.monotonic() > self._told_s + TEXT_PERIOD_S:
+            self._told_s = time.monotonic()
             names, values = zip(*overlay.hud.lines(), strict=True)
             self._window.set_texts((None, None, "\n".join(names), "\n".join(values)))
-        self._window.sync()
         self._due_s = max(self._due_s + self._period_s, time.monotonic())
         time.sleep(max(0.0, self._due_s - time.monotonic()))
 
     def close(self) -> None:
-        """Close the window."""
+        """Close the window and wait until it is gone: what it still draws must not outlive the screen."""
         self._window.close()
+        until_s = time.monotonic() + CLOSING_S
+        while self._window.d is not None and time.monotonic() < until_s:
+            time.sleep(0.01)
+
+
+def _look_from(view: mujoco.MjvCamera, model: mujoco.MjModel, data: mujoco.MjData, camera: str) -> None:
+    """Put a camera that a person can move to where a camera of the model is now, turning about what it looks at."""
+    mujoco.mj_camlight(model, data)
+    number = model.camera(camera).id
+    eye, forward = data.cam_xpos[number], -data.cam_xmat[number].reshape(3, 3)[:, 2]
+    view.type = mujoco.mjtCamera.mjCAMERA_FREE
+    view.distance = float(np.linalg.norm(data.body(VESSEL_BODY).xpos - eye))
+    view.lookat[:] = eye + view.distance * forward
+    view.azimuth = math.degrees(math.atan2(forward[1], forward[0]))
+    view.elevation = math.degrees(math.asin(float(np.clip(forward[2], -1.0, 1.0))))
 
 
 def has_screen() -> bool:

@@ -30,7 +30,12 @@ class Window:
     def __init__(self, model: mujoco.MjModel, patience: int = 10_000) -> None:
         self.user_scn = mujoco.MjvScene(model, 1000)
         self.patience, self.synced = patience, 0
+        self.cam = mujoco.MjvCamera()
         self.texts: Any = ()
+
+    @property
+    def d(self) -> object:
+        return self if self.patience else None
 
     def lock(self) -> Any:
         return contextlib.nullcontext()
@@ -84,7 +89,7 @@ def empty(mug_pour: Reference) -> Iterator[PandaPourEnv]:
 
 
 def test_viewer_shows_particles_and_overlays_of_this_moment_only(empty: PandaPourEnv, windows: list[Window]) -> None:
-    viewer = Viewer(empty.model, empty.data, fps=1000)
+    viewer = Viewer(empty.model, empty.data, "front", fps=1000)
     (window,) = windows
     particles = np.zeros((7, 3)), 0.005
     viewer.show(particles, Overlay(np.eye(4), np.zeros((4, 3)), HUD))
@@ -101,8 +106,22 @@ def test_viewer_shows_particles_and_overlays_of_this_moment_only(empty: PandaPou
     assert (viewer.is_open, window.synced) == (False, 3)
 
 
+@pytest.mark.parametrize("camera", ["front", "wrist"])
+def test_window_looks_from_the_camera_at_first(camera: str, empty: PandaPourEnv, windows: list[Window]) -> None:
+    viewer = Viewer(empty.model, empty.data, camera, fps=1000)
+    (window,) = windows
+    mujoco.mjv_updateScene(
+        empty.model, empty.data, mujoco.MjvOption(), None, window.cam, mujoco.mjtCatBit.mjCAT_ALL, window.user_scn
+    )
+    seen = window.user_scn.camera[0]
+    number = empty.model.camera(camera).id
+    assert np.allclose(seen.pos, empty.data.cam_xpos[number], atol=0.05)
+    assert np.allclose(seen.forward, -empty.data.cam_xmat[number].reshape(3, 3)[:, 2], atol=1e-3)
+    viewer.close()
+
+
 def test_viewer_keeps_real_time(empty: PandaPourEnv, windows: list[Window]) -> None:
-    viewer = Viewer(empty.model, empty.data, fps=50)
+    viewer = Viewer(empty.model, empty.data, "front", fps=50)
     start = time.monotonic()
     for _ in range(10):
         viewer.show()
@@ -113,7 +132,7 @@ def test_viewer_keeps_real_time(empty: PandaPourEnv, windows: list[Window]) -> N
 def test_viewer_without_a_screen_names_the_mend(empty: PandaPourEnv) -> None:
     assert not has_screen()
     with pytest.raises(UserError, match="rgb_array"):
-        Viewer(empty.model, empty.data, fps=25)
+        Viewer(empty.model, empty.data, "front", fps=25)
     with pytest.raises(UserError, match="rgb_array"):
         PandaPourEnv(num_particles=0, render_mode="human")
     assert empty.metadata["render_modes"] == ["rgb_array"] or has_screen()
@@ -126,7 +145,7 @@ def test_viewer_with_a_screen_that_is_not_there_does_not_hang(
     monkeypatch.setenv("DISPLAY", ":7391")
     assert has_screen()
     with pytest.raises(UserError, match=":7391"):
-        Viewer(empty.model, empty.data, fps=25)
+        Viewer(empty.model, empty.data, "front", fps=25)
 
 
 def test_window_follows_every_step_and_reset(mug_pour: Reference, windows: list[Window]) -> None:
