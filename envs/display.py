@@ -44,6 +44,10 @@ class Display:
         self._overlays = Overlays(overlays, fps)
         self._viewer: Viewer | None = None
 
+    def twin(self) -> Display:
+        """An equal one that has shown nothing yet."""
+        return Display(self._mode, self._camera, self._size, self._overlays.names, self._fps)
+
     @property
     def is_window(self) -> bool:
         """Whether a person watches: then every step and reset is shown, without being asked."""

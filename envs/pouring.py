@@ -6,9 +6,10 @@ k is reached at its end, when the object should be at knot k + 1 of the referenc
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import gymnasium as gym
 import mujoco
@@ -142,12 +143,10 @@ class PandaPourEnv(gym.Env[Observation, NDArray[np.float32]]):
         self.tolerance = tolerance
         self.termination = preset("termination", termination, TERMINATIONS, Termination)
         self._start = preset("start", start, STARTS, ReferenceStart)
-        self.obs_mode, self.control_mode = obs_mode, control_mode
+        self.obs_mode, self.control_mode, self.render_mode = obs_mode, control_mode, render_mode
         self.grasp: Grasp = grasp
-        self.image_size = picture_size("image_size", image_size)
-        render_size = picture_size("render_size", render_size)
-        self.render_mode = render_mode
-        self._display = Display(render_mode, render_camera, render_size, overlays, self.control_hz)
+        self.image_size, size = picture_size("image_size", image_size), picture_size("render_size", render_size)
+        self._display = Display(render_mode, render_camera, size, overlays, self.control_hz)
         self.success_poured_fraction, self.success_spilled_fraction = success_poured_fraction, success_spilled_fraction
         fps = int(control_hz) if control_hz % 1 == 0 else control_hz
         self.metadata = {"render_modes": render_modes(), "render_fps": fps}
@@ -160,20 +159,15 @@ class PandaPourEnv(gym.Env[Observation, NDArray[np.float32]]):
         self._stages = Stages(
             self._base, self._num_particles, self._liquid, step_s, self._substeps, actuation, self.grasp, own_cameras
         )
-        self._stage = self._stages.get(-1)
-        scene = self.simulation.scene
-        self._settle_steps = round(settle_s * self.control_hz)
-        self._max_episode_steps = len(self._base) - 1 + self._settle_steps
+        scene = self._stages.get(-1).simulation.scene
+        self._max_episode_steps = len(self._base) - 1 + round(settle_s * self.control_hz)
         into = f"pour from the {{}} into the {scene.receptacle.category}" if scene.receptacle else "move the {}"
-        self.task = into.format(scene.vessel.category).replace("_", " ")
-        self.task_description = self.task
+        self.task = self.task_description = into.format(scene.vessel.category).replace("_", " ")
         self.action_space = self._control.space
         self.action_names = tuple(entry.name for entry in self._control.entries)
         self.observation_space, self.observation_names = observations.space(obs_mode, self.cameras, self.image_size)
         self._starts = StartSampler(self._start or ReferenceStart(), len(self._base))
-        self._seed: int | None = None
-        self._worst_m: float
-        self._worst_rad: float
+        self._worst_m = self._worst_rad = 0.0
         self._begin(Randomization().draw(np.random.default_rng(0)), 0)
 
     # ------------------------------------------------------------------ Gymnasium
@@ -181,8 +175,6 @@ class PandaPourEnv(gym.Env[Observation, NDArray[np.float32]]):
     def reset(self, *, seed: int | None = None, options: Mapping[str, Any] | None = None) -> tuple[Observation, Info]:
         """Begin an episode; see the class for `options`."""
         super().reset(seed=seed)
-        if seed is not None:
-            self._seed = seed
         options = dict(options or {})
         if unknown := sorted(set(options) - set(_OPTIONS)):
             raise UserError(f"reset has no option {', '.join(unknown)}; it knows {', '.join(_OPTIONS)}")
@@ -218,7 +210,7 @@ class PandaPourEnv(gym.Env[Observation, NDArray[np.float32]]):
             physics, control, action = self._before
             state = {**self.get_state(), "simulation": physics, "target": control.target, "rate": control.rate}
             state["step"] = self._step_index - 1
-            raise PhysicsError(diverged_message(state, action, self._seed, self._step_index))
+            raise PhysicsError(diverged_message(state, action, self._np_random_seed, self._step_index))
         _, poured, spilled = self._share
         simulation.refresh()
         self._look()
@@ -257,6 +249,17 @@ class PandaPourEnv(gym.Env[Observation, NDArray[np.float32]]):
             self._display.close()
         if hasattr(self, "_stages"):
             self._stages.close()
+
+    def twin(self) -> Self:
+        """An equal environment that awaits its first reset; what never changes is shared, so it is made at once."""
+        made = copy.copy(self)
+        made._np_random, made._np_random_seed = None, None
+        made._stages, made._display = self._stages.twin(), self._display.twin()
+        made._control = Control(self.control_mode, self.control_hz, self._substeps)
+        made._starts = StartSampler(self._start or ReferenceStart(), len(self._base))
+        made.action_space, made.observation_space = made._control.space, copy.deepcopy(self.observation_space)
+        made._begin(Randomization().draw(np.random.default_rng(0)), 0)
+        return made
 
     # ------------------------------------------------------------------ state
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any
@@ -136,6 +137,12 @@ class ModelVariation:
             body: np.array([i for i in range(model.nmat) if model.mat(i).name.startswith(f"{body}_")], int)
             for body in ("vessel", "receptacle")
         }
+
+    def of(self, model: mujoco.MjModel) -> ModelVariation:
+        """The same for a copy of the model, whichever draw it was copied with."""
+        made = copy.copy(self)
+        made._model = model
+        return made
 
     def apply(self, draw: Draw) -> None:
         """Make the model the one of an episode."""

@@ -12,4 +12,8 @@ def register_envs() -> None:
 
     for task, module in (("Pour", "pouring"), ("Track", "tracking")):
         if f"Panda{task}-v0" not in registry:
-            register(id=f"Panda{task}-v0", entry_point=f"vid2demo.envs.{module}:Panda{task}Env")
+            register(
+                id=f"Panda{task}-v0",
+                entry_point=f"vid2demo.envs.{module}:Panda{task}Env",
+                vector_entry_point=f"vid2demo.envs.vector:Panda{task}VectorEnv",
+            )

@@ -6,12 +6,14 @@ particles are.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+import copy
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import mujoco
 import numpy as np
+from mujoco.rollout import Rollout
 from numpy.typing import NDArray
 
 from ..extract.errors import UserError
@@ -32,6 +34,8 @@ if TYPE_CHECKING:
 CONDUIT_STRIDE = 2
 SETTLE_AT_START_S = 1.5
 _PHYSICS = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+_MOVING = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
+_ENGINE = Rollout()  # has no threads of its own
 ARM = 7
 
 
@@ -89,6 +93,15 @@ class Simulation:
         self.settled_m: Array = self._settle(reference.q_start_rad) if alike is None else alike.settled_m
         self.settled_held = int(np.count_nonzero(self.scene.vessel_cavity.contains(self.settled_m)))
 
+    def twin(self, reference: Reference) -> Simulation:
+        """An equal simulation with a model and a state of its own; reference: what this one was made of."""
+        made = copy.copy(self)
+        made.model = copy.copy(self.model)
+        made.scene, made.data = replace(self.scene, model=made.model), mujoco.MjData(made.model)
+        made._bind(reference)
+        made.holding.take_over(self.holding)
+        return made
+
     # ------------------------------------------------------------------ motion
 
     def begin(self, q_rad: Array, receptacle_m: Array) -> None:
@@ -102,16 +115,14 @@ class Simulation:
         """Move the receptacle's origin to (3,)."""
         self.receptacle_m[:] = self.model.body_pos[self._receptacle_id] = position_m
 
-    def advance(self, commands: Iterable[Array]) -> None:
-        """One physics step for each of the commands (7,) to the arm."""
+    def advance(self, commands: Array) -> None:
+        """One physics step for each of the commands (K, 7) to the arm."""
         data, model, control, step, conduit = self.data, self.model, self.data.ctrl, mujoco.mj_step, self._conduit
         if self._fast is not None:
             self._advance_fast(commands, self._fast)
             return
         if conduit is None:
-            for command in commands:
-                control[:ARM] = command
-                step(model, data)
+            self._advance_engine(commands)
             return
         for i, command in enumerate(commands):
             control[:ARM] = command
@@ -120,7 +131,29 @@ class Simulation:
                 self._read_twist()
                 conduit.move(self.particles_m, self.particle_velocities_m_s, self.T_world_vessel, self.twist)
 
-    def _advance_fast(self, commands: Iterable[Array], liquid: FastLiquid) -> None:
+    def _advance_engine(self, commands: Array) -> None:
+        """All steps in one call, during which other threads have Python for themselves."""
+        data, start_s = self.data, self.data.time
+        controls = np.empty((1, len(commands), self.model.nu))
+        controls[0, :, :ARM], controls[0, :, ARM:] = commands, data.ctrl[ARM:]
+        state = np.empty((1, mujoco.mj_stateSize(self.model, _MOVING)))
+        mujoco.mj_getState(self.model, data, state[0], _MOVING)
+        _ENGINE.rollout(
+            [self.model],
+            [data],
+            state,
+            controls,
+            skip_checks=True,
+            nstep=len(commands),
+            initial_warmstart=data.qacc_warmstart[None],
+            chunk_size=1,
+        )
+        # A rollout ends at a warning of the engine; single steps go on.
+        for command in commands[round((data.time - start_s) / self.model.opt.timestep) :]:
+            data.ctrl[:ARM] = command
+            mujoco.mj_step(self.model, data)
+
+    def _advance_fast(self, commands: Array, liquid: FastLiquid) -> None:
         data, model, conduit = self.data, self.model, self._conduit
         push = data.xfrc_applied[self._vessel_id]
         center_m = data.xipos[self._vessel_id]

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import copy
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cached_property
+from threading import RLock
 from typing import Literal
 
 import numpy as np
@@ -50,6 +51,7 @@ class Stage:
             cameras=cameras,
             alike=None if alike is None else alike.simulation,
         )
+        self._rehearsal = _Once(self._rehearse)
         self.pictures = Cameras(self.simulation.model)
         self._variation = ModelVariation(self.simulation.model)
         self.targets = self._base_targets = Targets.of(reference)
@@ -71,14 +73,28 @@ class Stage:
         q_rad = self.rehearsal.begin(self.simulation, self.reference, index)
         return q_rad, (self.rehearsal.q_rad[index] - self.rehearsal.q_rad[index - 1]) * self.base.control_hz
 
-    @cached_property
+    @property
     def rehearsal(self) -> Rehearsal:
         """The states along the reference; played through when first asked for."""
+        return self._rehearsal.get()
+
+    def _rehearse(self) -> Rehearsal:
         return Rehearsal(self.base, Simulation(*self._arguments, grasp=self._grasp, alike=self.simulation))
+
+    def twin(self) -> Stage:
+        """An equal stage with a simulation of its own. It may be made while an episode is played on this one."""
+        made = copy.copy(self)
+        made.simulation = self.simulation.twin(self.base)
+        made.pictures = Cameras(made.simulation.model)
+        made._variation = self._variation.of(made.simulation.model)
+        return made
 
 
 class Stages:
-    """One stage for each shape of the receptacle, each built when first needed and kept."""
+    """One stage for each shape of the receptacle, each made when first needed and kept.
+
+    Those of a twin are built once for both.
+    """
 
     def __init__(
         self,
@@ -96,20 +112,49 @@ class Stages:
 
         self._build = build
         self._stages = {-1: build(reference)}
+        # What this one and its twins have built, whoever asked first; they may be used from several threads.
+        self._built, self._lock = dict(self._stages), RLock()
 
     def get(self, shape: int) -> Stage:
         """The stage with the receptacle's seeded shape, or with its own for -1 or when there is none."""
-        if not self._stages[-1].base.has_receptacle:
-            return self._stages[-1]
+        if not self._built[-1].base.has_receptacle:
+            shape = -1
         if shape not in self._stages:
+            self._stages[shape] = self._take(shape)
+        return self._stages[shape]
+
+    def twin(self) -> Stages:
+        """Equal stages, to play on beside these."""
+        made = copy.copy(self)
+        made._stages = {}
+        return made
+
+    def _take(self, shape: int) -> Stage:
+        with self._lock:
+            if shape in self._built:
+                return self._built[shape].twin()
             from ..extract.vessels import make_vessel
 
-            own = self._stages[-1]
+            own = self._built[-1]
             other = make_vessel(own.base.receptacle().category, shape)
-            self._stages[shape] = self._build(with_receptacle(own.base, other), own)
-        return self._stages[shape]
+            self._built[shape] = self._build(with_receptacle(own.base, other), own)
+            return self._built[shape]
 
     def close(self) -> None:
         """Free the rendering contexts."""
         for stage in self._stages.values():
             stage.pictures.close()
+
+
+class _Once[T]:
+    """A value that is made when first asked for, by one of several threads."""
+
+    def __init__(self, make: Callable[[], T]) -> None:
+        self._make, self._lock = make, RLock()
+        self._made: list[T] = []
+
+    def get(self) -> T:
+        with self._lock:
+            if not self._made:
+                self._made.append(self._make())
+            return self._made[0]

@@ -1,0 +1,54 @@
+"""A few threads that do jobs side by side; what they return does not depend on how many they are."""
+
+from __future__ import annotations
+
+import os
+from collections import deque
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+
+def usable_cpus() -> int:
+    """How many processors this process may run on."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+class Crew:
+    """`threads` threads, the caller's among them."""
+
+    def __init__(self, threads: int) -> None:
+        self.threads = threads
+        self._pool = ThreadPoolExecutor(threads - 1, "vid2demo") if threads > 1 else None
+
+    def run[T](self, job: Callable[[int], T], numbers: Sequence[int]) -> list[T]:
+        """job(n) for every number, in the order of the numbers.
+
+        All jobs are done before the first error in that order, if there is one, is raised.
+        """
+        waiting = deque(enumerate(numbers))
+        done: list[T | None] = [None] * len(numbers)
+        errors: list[tuple[int, Exception]] = []
+
+        def work() -> None:
+            while True:
+                try:
+                    place, number = waiting.popleft()
+                except IndexError:
+                    return
+                try:
+                    done[place] = job(number)
+                except Exception as error:
+                    errors.append((place, error))
+
+        helpers = [self._pool.submit(work) for _ in range(min(self.threads, len(numbers)) - 1)] if self._pool else []
+        work()
+        for helper in helpers:
+            helper.result()
+        if errors:
+            raise min(errors, key=lambda found: found[0])[1]
+        return done  # type: ignore[return-value]
+
+    def close(self) -> None:
+        """End the threads."""
+        if self._pool is not None:
+            self._pool.shutdown()
