@@ -34,13 +34,15 @@ class PoseCandidate:
 
     iou: intersection over union of its silhouette with the mask.  box_iou: of its bounding box with the given box,
     which counts thin parts that masks lose.  edge: share of its outline that runs along image edges, which tells
-    poses apart where the mask is wrong.
+    poses apart where the mask is wrong.  stands: whether an upright pose is likelier than others, which can only be
+    said of objects whose +z is known to point up.
     """
 
     T_camera_object: Array
     iou: float
     box_iou: float
     edge: float = 0.0
+    stands: bool = True
 
     @property
     def merit(self) -> float:
@@ -49,7 +51,7 @@ class PoseCandidate:
             self.iou
             + BOX_WEIGHT * self.box_iou
             + EDGE_WEIGHT * self.edge
-            + UPRIGHT_BONUS * is_upright(self.T_camera_object)
+            + UPRIGHT_BONUS * (self.stands and is_upright(self.T_camera_object))
         )
 
 
@@ -80,6 +82,7 @@ def find_first_pose(
     box_xywh_px: Box | None = None,
     symmetry: Symmetry = Symmetry(),  # noqa: B008 - frozen
     any_rotation: bool = True,
+    stands: bool = True,
     keep: int = 60,
 ) -> list[PoseCandidate]:
     """Poses that explain a mask, best first.
@@ -87,6 +90,7 @@ def find_first_pose(
     box_xywh_px: box around the whole object; the mask's own when not given.
     symmetry: turns after which the mesh looks the same need not be searched.
     any_rotation: also try rotations that are not upright (600 of them, spread over SO(3)).
+    stands: whether the object is likely to stand on its -z.
     """
     yaws = np.arange(0.0, 360.0 / symmetry.order, 10.0) if symmetry.order else (0.0,)
     tries = [upright_rotation(e, float(yaw)) for e in ELEVATIONS_DEG for yaw in yaws]
@@ -100,7 +104,7 @@ def find_first_pose(
     coarse = []
     for R in tries:
         T = _placed(mesh, R, small_camera, small_box)
-        coarse.append(PoseCandidate(T, *silhouette_ious(mesh, T, small_camera, small_mask, small_box)))
+        coarse.append(PoseCandidate(T, *silhouette_ious(mesh, T, small_camera, small_mask, small_box), stands=stands))
     coarse.sort(key=lambda c: c.merit, reverse=True)
     coarse = coarse[: keep // 5] + distinct(coarse[keep // 5 :], 15, keep - keep // 5, np.inf, symmetry)
 
@@ -111,18 +115,24 @@ def find_first_pose(
             mesh, candidate.T_camera_object, camera_matrix, bins, colours, steps_px=(4, 3, 2, 1),
             prior_rotation_rad=0.12, prior_translation=0.05, prior_depth=0.1,
         )  # fmt: skip
-        found.append(judge(mesh, result.T_camera_object, camera_matrix, rgb, mask, box))
+        found.append(judge(mesh, result.T_camera_object, camera_matrix, rgb, mask, box, stands))
     found.sort(key=lambda c: c.merit, reverse=True)
     return found
 
 
 def judge(
-    mesh: TrackingMesh, T_camera_object: Array, camera_matrix: Array, rgb: Image, mask: Mask, box: Box
+    mesh: TrackingMesh,
+    T_camera_object: Array,
+    camera_matrix: Array,
+    rgb: Image,
+    mask: Mask,
+    box: Box,
+    stands: bool = True,
 ) -> PoseCandidate:
     """How well a pose explains an image, the mask cut from it and the box around the object."""
     ious = silhouette_ious(mesh, T_camera_object, camera_matrix, mask, box)
     edge = edge_score(mesh, T_camera_object, camera_matrix, edge_strength(rgb))
-    return PoseCandidate(T_camera_object, *ious, edge)
+    return PoseCandidate(T_camera_object, *ious, edge, stands)
 
 
 def distinct(

@@ -245,7 +245,7 @@ def _start(
     for model in candidates:
         poses = find_first_pose(
             model.mesh, small, small_mask, small_camera, box_xywh_px=small_box,
-            symmetry=model.symmetry,
+            symmetry=model.symmetry, stands=model.vessel is not None,
         )  # fmt: skip
         ranked += [(pose, model) for pose in distinct(poses, 40, HYPOTHESES, HYPOTHESES_WITHIN, model.symmetry)]
     ranked.sort(key=lambda entry: entry[0].merit, reverse=True)
@@ -281,7 +281,7 @@ def _fitted(
     """One hypothesis carried on: the vessel's shape and pose fitted to the mask re-cut near its silhouette."""
     T = pose.T_camera_object
     evidence = _evidence(model.mesh, rgb, T, camera_matrix, mask, band_px)
-    pose = judge(model.mesh, T, camera_matrix, rgb, evidence, box)
+    pose = judge(model.mesh, T, camera_matrix, rgb, evidence, box, model.vessel is not None)
     for _ in range(FIT_ROUNDS if model.vessel is not None else 0):
         assert model.vessel is not None
         view = View(*mask_evidence(evidence), T, box if source == "given" else None, edges)
