@@ -25,7 +25,7 @@ from .vessel_geometry import Box
 
 SUBSTEPS = 4
 # How far a particle may move against a vessel in a step and still find its walls in the grid, and the grid's cells.
-REACH_M, CELL_M = 0.004, 0.005
+REACH_M, CELL_M = 0.003, 0.004
 # The vessel feels the particles' push through a filter of this time constant: a step's blows are not smooth.
 FILTER_S = 0.01
 
@@ -55,11 +55,8 @@ class FastLiquid:
         self.velocities_m_s: Array = np.zeros((count, 3))
         self.wrench: Array = np.zeros(6)
         mass_kg = liquid.particle_mass_kg(radius_m)
-        h = timestep_s / SUBSTEPS
-        # From a sum of ways in substeps to a mean force of the particles on the vessel.
-        self._force = -mass_kg / h / timestep_s
-        self._filter = -math.expm1(-timestep_s / FILTER_S)
-        self._numbers = (radius_m, timestep_s, liquid.friction, liquid.drag_1_s, SUBSTEPS)
+        taken = -math.expm1(-timestep_s / FILTER_S)
+        self._numbers = (radius_m, timestep_s, mass_kg, liquid.friction, liquid.drag_1_s, taken, SUBSTEPS)
         groups = [vessel_boxes, receptacle_boxes, static_shapes]
         self._walls = _walls(groups, radius_m + REACH_M)
         self._poses: Array = np.tile(np.eye(4), (len(groups), 2, 1, 1))
@@ -69,7 +66,6 @@ class FastLiquid:
         self._grid = (np.zeros((count, 4), np.int32), np.zeros(buckets + 1, np.int32), np.zeros(count, np.int32))
         self._which = np.zeros((kernels.MAX_CONTACTS * count, 2), np.int32)
         self._contacts: Array = np.zeros((kernels.MAX_CONTACTS * count, kernels.CONTACT_WIDTH))
-        self._moved: Array = np.zeros(6)
 
     def place(self, positions_m: Array) -> None:
         """Put the particles at (N, 3) in the world, at rest."""
@@ -91,10 +87,9 @@ class FastLiquid:
             self._grid,
             self._which,
             self._contacts,
-            self._moved,
+            self.wrench,
             self._numbers,
         )
-        self.wrench += self._filter * (self._force * self._moved - self.wrench)
         return self.wrench
 
     def settle(self, T_world_vessel: Array, T_world_receptacle: Array, duration_s: float) -> None:

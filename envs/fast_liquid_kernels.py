@@ -23,7 +23,7 @@ GRAVITY_M_S2 = 9.81
 # when they overlap a little.
 PAIR_REACH_RADII = 2.5
 # Contacts are kept ready for what neighbours may push into a wall within a step.
-SLACK_RADII = 0.2
+SLACK_RADII = 0.1
 # A sphere counts as arrived when it is so near to a wall; and so many strides are made on the way to it.
 ARRIVED_RADII, MAX_STRIDES = 0.02, 8
 # Overlaps are undone no faster than this, or the particles would be shot apart.
@@ -216,8 +216,9 @@ def find_contacts(
                     continue
                 cell = groups[g, 2] + (cx * groups[g, 4] + cy) * groups[g, 5] + cz
                 low, high = starts[cell], starts[cell + 1]
-            end = 1.0
-            for place in range(low, high):
+            # Ways shorter than the slack need no following: all that they could reach is looked at from their start.
+            end = 1.0 if way > slack else 0.0
+            for place in range(low, high if end > 0.0 else low):
                 k = items[place] if listed else place
                 if not within(shapes, k, ax, ay, az, radius_m + way + arrived):
                     continue
@@ -434,11 +435,14 @@ def advance(
     grid: tuple[Any, Any, Any],
     which: Ints,
     contacts: Array,
-    moved: Array,
-    numbers: tuple[float, float, float, float, int],
+    wrench: Array,
+    numbers: tuple[float, float, float, float, float, float, int],
 ) -> None:
-    """One step in small substeps, each with one sweep over all constraints (Macklin et al. 2019)."""
-    radius_m, timestep_s, friction, drag_1_s, substeps = numbers
+    """One step in small substeps, each with one sweep over all constraints (Macklin et al. 2019).
+
+    numbers: radius, time step, mass, friction, drag, part of a new push that `wrench` takes on, substeps.
+    """
+    radius_m, timestep_s, mass_kg, friction, drag_1_s, taken, substeps = numbers
     first, goal, last, chosen = room
     fall = 0.5 * GRAVITY_M_S2 * timestep_s * timestep_s
     for i in range(len(x)):
@@ -454,21 +458,23 @@ def advance(
     )
     h = timestep_s / substeps
     kept = 1.0 / (1.0 + drag_1_s * h)
-    moved[:] = 0.0
+    moved = np.zeros(6)
     origin = poses[0, 1, :3, 3]
+    # All coordinates in one row, which compiles to faster loops.
+    x_row, v_row, last_row = x.reshape(-1), v.reshape(-1), last.reshape(-1)
+    rate_hz = 1.0 / h
     for s in range(substeps):
         for i in range(len(x)):
             v[i, 2] -= GRAVITY_M_S2 * h
-            for axis in range(3):
-                v[i, axis] *= kept
-                last[i, axis] = x[i, axis]
-                x[i, axis] += h * v[i, axis]
+        for a in range(len(x_row)):
+            v_row[a] *= kept
+            last_row[a] = x_row[a]
+            x_row[a] += h * v_row[a]
         project_pairs(x, last, pairs, pair_count, radius_m, friction, h)
         share, part = (s + 1) / substeps, 1 / substeps
         project_contacts(x, last, which, contacts, count, share, part, friction, h, origin, moved)
-        for i in range(len(x)):
-            for axis in range(3):
-                v[i, axis] = (x[i, axis] - last[i, axis]) / h
+        for a in range(len(x_row)):
+            v_row[a] = rate_hz * (x_row[a] - last_row[a])
     # Who was knocked off the foreseen way may have met walls that nobody looked for.
     strayed = 0
     far = SLACK_RADII * radius_m
@@ -481,3 +487,6 @@ def advance(
         first, x, chosen, strayed, radius_m, shapes, groups, lows, starts, items, poses, which, contacts
     )
     catch(x, v, which, contacts, count, timestep_s, h, origin, moved)
+    for axis in range(6):
+        push = -mass_kg / h / timestep_s * moved[axis]
+        wrench[axis] += taken * (push - wrench[axis])

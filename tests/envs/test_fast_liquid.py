@@ -103,18 +103,19 @@ class TestMechanics:
         arm_m = fast.positions_m.mean(axis=0) - T[:3, 3]
         np.testing.assert_allclose(fast.wrench[3:], np.cross(arm_m, [0, 0, -weight_n]), atol=2e-4)
 
-    def test_a_vessel_that_is_shaken_feels_what_its_contents_gain(self) -> None:
+    def test_the_vessel_feels_all_that_its_contents_gain(self) -> None:
         fast, _, _ = filled("gooseneck_kettle", 80)
         run(fast, 1.0, np.eye(4))
         mass_kg = Liquid().particle_mass_kg(fast.radius_m)
-        before, given_ns = fast.velocities_m_s.sum(axis=0) * mass_kg, np.zeros(3)
+        start, felt_ns = fast.velocities_m_s.sum(axis=0) * mass_kg, np.zeros(3)
         poses = [make_pose(None, (0.05 * (1 - math.cos(12 * k * STEP_S)), 0.0, 0.0)) for k in range(200)]
         for was, now in pairwise(poses):
-            fast.step(was, now, FAR)
-            given_ns -= fast._force * fast._moved[:3] * STEP_S
-        gained = fast.velocities_m_s.sum(axis=0) * mass_kg - before
+            felt_ns += STEP_S * fast.step(was, now, FAR)[:3]
+        gained_ns = fast.velocities_m_s.sum(axis=0) * mass_kg - start
         weight_ns = 199 * STEP_S * 80 * mass_kg * GRAVITY_M_S2
-        np.testing.assert_allclose(gained, given_ns - [0, 0, weight_ns], atol=0.02 * weight_ns)  # drag takes the rest
+        # The filter holds a little back, drag takes a little away.
+        np.testing.assert_allclose(-felt_ns - [0, 0, weight_ns], gained_ns, atol=0.04 * weight_ns)
+        assert abs(gained_ns[0]) > 0.05 * weight_ns
 
 
 class TestRest:
