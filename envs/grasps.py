@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 # What the fingers span at most, less a little room on both sides.
 MAX_WIDTH_M = 2 * FINGER_MAX_M - 0.002
+# The tips reach so far below a rim whose wall they hold.
+RIM_GRASP_M = 0.022
 # Boxes of the hand in its own frame, m: (low, high). The pads end 1 cm beyond the tcp; the palm begins 45 mm behind.
 _PALM = (np.array([-0.032, -0.102, -0.14]), np.array([0.032, 0.102, -0.04]))
 _FINGER_X_M, _FINGER_Z_M, _FINGER_THICK_M = 0.011, (-0.045, 0.011), 0.018
@@ -49,17 +51,40 @@ class Grasp:
 def grasp_candidates(vessel: Vessel) -> list[Grasp]:
     """Grasps of all regions of a vessel: slid along the region, turned about it, pitched, with either palm side up.
 
-    Grasps whose palm or fingers would cut into the vessel are left out. Regions wider than the fingers open are used
-    only when the vessel has no other.
+    Grasps whose palm or fingers would cut into the vessel are left out. What is wider than the fingers open is held by
+    the wall at its rim; regions that are too wide are used only when it has no rim either.
     """
     points = surface_points(vessel)
-    regions = list(vessel.grasps)
-    if narrow := [region for region in regions if region.width_m <= MAX_WIDTH_M]:
-        regions = narrow
+    regions = [region for region in vessel.grasps if region.width_m <= MAX_WIDTH_M]
+    regions = regions or rim_regions(vessel) or list(vessel.grasps)
     grasps = [grasp for region in regions for grasp in _of_region(region, vessel)]
     free = [grasp for grasp in grasps if not _cuts(grasp, points)]
     # A vessel that no hand can hold cleanly is still shown to the user, who reads of it in the notes.
     return free or grasps
+
+
+def rim_regions(vessel: Vessel) -> list[GraspRegion]:
+    """Places at the rim of an open vessel, on the sides and behind, where one finger goes inside and one outside."""
+    from ..extract.vessels import GraspRegion
+
+    profile = vessel.interior
+    if not vessel.is_open or vessel.wall_m > MAX_WIDTH_M:
+        return []
+    rings = profile.outlines(72)
+    top, deep = rings[-1], rings[int(np.argmin(np.abs(profile.z_m - (profile.z_m[-1] - RIM_GRASP_M))))]
+    middle = np.array([*profile.axis_xy_m, 0.0])
+    regions = []
+    for angle_rad in np.deg2rad([90.0, 135.0, 180.0, 225.0, 270.0]):
+        outward = np.array([np.cos(angle_rad), np.sin(angle_rad), 0.0])
+        tangent = np.cross([0.0, 0.0, 1.0], outward)
+        k = int(np.argmax((top - middle) @ outward / np.linalg.norm((top - middle)[:, :2], axis=1)))
+        # Fingers go in along the wall, which may lean.
+        up = top[k] - deep[k]
+        up -= (up @ tangent) * tangent
+        up /= np.linalg.norm(up)
+        center = top[k] - RIM_GRASP_M / 2 * up + vessel.wall_m / 2 * np.cross(tangent, up)
+        regions.append(GraspRegion("body", center, tangent, 0.02, vessel.wall_m, -up))
+    return regions
 
 
 def _of_region(region: GraspRegion, vessel: Vessel) -> list[Grasp]:

@@ -34,6 +34,8 @@ OVERLAP_M, INTRUSION_M = 0.006, 0.0001
 # Strips shorter than a particle would only add edges for it to be squeezed between.
 MIN_STRIP_M = 0.01
 WIDE_RADIUS_M = 0.045
+# Share of edges between faces of different colours; parts of one colour each stay below 0.05, textures above 0.1.
+SPECKLED_SHARE = 0.07
 _IDENTITY = np.eye(4)
 
 
@@ -303,6 +305,8 @@ def collision_boxes(vessel: Vessel, cavity: Cavity, wall_m: float = SWUNG_WALL_M
 
 def visual_parts(mesh: Any, max_faces: int = 3000) -> list[tuple[tuple[float, ...], Array, NDArray[np.int64]]]:
     """(rgba, vertices (V, 3), faces (F, 3)) for each colour of a trimesh, decimated to about `max_faces` in all."""
+    if len(mesh.faces) > max_faces and _is_speckled(mesh):
+        mesh = _decimated_whole(mesh, max_faces)
     colors = np.ascontiguousarray(mesh.visual.face_colors, np.uint8)
     # Four bytes as one number: sorting rows takes ten times as long.
     packed = colors.view(np.uint32)[:, 0]
@@ -316,6 +320,23 @@ def visual_parts(mesh: Any, max_faces: int = 3000) -> list[tuple[tuple[float, ..
         rgba = tuple(float(v) / 255 for v in color)
         parts.append((rgba, np.asarray(part.vertices, float), np.asarray(part.faces, np.int64)))
     return parts
+
+
+def _is_speckled(mesh: Any) -> bool:
+    """Whether colours change so often, as those from a texture do, that patches of one colour are next to nothing."""
+    pairs = np.asarray(mesh.visual.face_colors)[mesh.face_adjacency]
+    return bool(np.mean(np.any(pairs[:, 0] != pairs[:, 1], axis=1)) > SPECKLED_SHARE)
+
+
+def _decimated_whole(mesh: Any, max_faces: int) -> Any:
+    """A mesh with fewer faces, each in the colour of the nearest old one: patches by themselves would tear apart."""
+    import trimesh
+    from scipy.spatial import cKDTree
+
+    fewer = mesh.simplify_quadric_decimation(face_count=max_faces)
+    _, nearest = cKDTree(mesh.triangles_center).query(fewer.triangles_center)
+    colors = np.asarray(mesh.visual.face_colors)[nearest]
+    return trimesh.Trimesh(fewer.vertices, fewer.faces, process=False, face_colors=colors)
 
 
 def gripper_half_width_m(vessel: Vessel, T_hand_object: Array, pad_m: float = 0.009, limit_m: float = 0.04) -> float:

@@ -10,6 +10,7 @@ from vid2demo.envs.panda import Q_HOME_RAD
 from vid2demo.envs.receptacle import surface_points
 from vid2demo.envs.reference import Reference, minimum_jerk
 from vid2demo.envs.retiming import DDQ_MAX_RAD_S2, slowed
+from vid2demo.envs.vessel_geometry import gripper_half_width_m
 from vid2demo.extract.geometry import Array, make_pose, transform_points
 from vid2demo.extract.vessels import CATEGORIES, Vessel, make_vessel
 
@@ -27,9 +28,20 @@ def test_every_vessel_of_the_library_has_grasps_that_do_not_cut_into_it(category
         local = transform_points(grasp.T_hand_object, points)
         palm = np.all(np.abs(local - [0.0, 0.0, -0.09]) < [0.03, 0.10, 0.04], axis=1)
         assert palm.sum() <= 2
-    widths = [grasp.width_m for grasp in grasps]
-    narrow = any(region.width_m <= MAX_WIDTH_M for region in vessel.grasps)
-    assert narrow == all(width <= MAX_WIDTH_M for width in widths)
+    assert all(grasp.fits_hand for grasp in grasps)
+
+
+def test_what_is_too_wide_is_held_by_the_wall_at_its_rim() -> None:
+    bowl = make_vessel("bowl")
+    assert all(region.width_m > MAX_WIDTH_M for region in bowl.grasps)
+    for grasp in grasp_candidates(bowl):
+        assert grasp.width_m == bowl.wall_m
+        below_rim_m = bowl.interior.z_m[-1] - grasp.T_object_hand[2, 3]
+        assert 0.0 < below_rim_m < 0.02
+        assert gripper_half_width_m(bowl, grasp.T_hand_object) == pytest.approx(bowl.wall_m / 2, abs=0.004)
+        # From above, or from a side of it, and never at the lip.
+        assert grasp.T_object_hand[2, 2] < 0
+        assert grasp.T_object_hand[0, 3] < 0.03
 
 
 def test_the_fingers_close_across_a_handle() -> None:
