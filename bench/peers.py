@@ -43,6 +43,7 @@ ALL = {
             ("PandaTrack-v0", {}),
             ("PandaPour-v0", {"num_particles": 50}),
             ("PandaPour-v0", {"num_particles": 100}),
+            ("PandaPour-v0", {"num_particles": 100, "liquid": {"solver": "fast"}}),
         ),
     ),
     # From mujoco 3.12 on, its comparison of enums fails.
@@ -135,7 +136,7 @@ def measure(module: str, env_id: str, kwargs: dict[str, Any], steps: int) -> dic
             resets += 1
     versions = {name: metadata.version(name) for name in ("mujoco", "gymnasium")}
     return {
-        "environment": env_id.removeprefix("gym_hil/") + "".join(f" {k}={v}" for k, v in kwargs.items()),
+        "environment": " ".join([env_id.removeprefix("gym_hil/"), *(f"{k}={v}" for k, v in kwargs.items())]),
         "steps_per_s": steps / seconds,
         "control_hz": 1.0 / period_s if period_s > 0 else None,
         "times_real_time": steps * period_s / seconds if period_s > 0 else None,
@@ -157,11 +158,11 @@ def clock_s(env: Any) -> float:
 
 def table(rows: list[dict[str, Any]]) -> str:
     """The rows for a person."""
-    lines = [f"{'':<20} {'environment':<42} {'steps/s':>8} {'control Hz':>11} {'x real time':>12} {'mujoco':>8}"]
+    lines = [f"{'':<20} {'environment':<64} {'steps/s':>8} {'control Hz':>11} {'x real time':>12} {'mujoco':>8}"]
     for row in rows:
         rate, times = (f"{row[k]:.4g}" if row[k] else "?" for k in ("control_hz", "times_real_time"))
         lines.append(
-            f"{row['peer']:<20} {row['environment']:<42} {row['steps_per_s']:>8.0f} {rate:>11} {times:>12} "
+            f"{row['peer']:<20} {row['environment']:<64} {row['steps_per_s']:>8.0f} {rate:>11} {times:>12} "
             f"{row['mujoco']:>8}"
         )
     return "\n".join(lines)

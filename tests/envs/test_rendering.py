@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+import os
+import subprocess
+import sys
 from collections.abc import Iterator
 from typing import Any
 
@@ -344,3 +347,27 @@ def test_render_draws_the_overlays_and_the_observations_stay_free_of_them(mug_po
 def test_rendering_arguments_are_checked(arguments: dict[str, Any], said: str, mug_pour: Reference) -> None:
     with pytest.raises(UserError, match=said):
         PandaPourEnv(mug_pour, num_particles=0, **arguments)
+
+
+def test_forked_process_draws_what_its_parent_drew() -> None:
+    code = """
+import multiprocessing
+from vid2demo.envs.pouring import PandaPourEnv
+
+def take(queue):
+    env = PandaPourEnv(num_particles=0, obs_mode="pixels", image_size=(32, 48))
+    queue.put(env.reset(seed=0)[0]["pixels"]["front"].tobytes())
+
+context = multiprocessing.get_context("fork")
+queue = context.Queue()
+take(queue)
+child = context.Process(target=take, args=(queue,), daemon=True)
+child.start()
+print(queue.get(timeout=60) == queue.get(timeout=60))
+"""
+    # As a vector environment of forked processes does; a rasterizer with threads of its own would wait for ever.
+    variables = {name: value for name, value in os.environ.items() if name != "LP_NUM_THREADS"}
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120, env=variables
+    )
+    assert done.stdout.strip() == "True"
