@@ -1,24 +1,21 @@
 """How many pictures a second the scene's cameras give with software rendering.
 
-    OMP_NUM_THREADS=1 LP_NUM_THREADS=0 MUJOCO_GL=egl python bench/rendering.py [--json]
+    OMP_NUM_THREADS=1 MUJOCO_GL=egl python bench/rendering.py [--json]
 
-The state's cost is left out: the pour stands still while it is drawn. CPU time of one thread (LP_NUM_THREADS=0 keeps
-Mesa's software rasterizer in it), in the middle of a pour of 100 particles. `beside` draws particles that are not in
-the model, as the fast liquid's are; `overlays` adds ghost, trail and figures.
+The state's cost is left out: a pour of 100 particles stands still in its middle while it is drawn. CPU time; Mesa's
+software rasterizer is kept in one thread. `beside` draws particles that are not in the model, as the fast liquid's are;
+`overlays` adds ghost, trail and figures.
 """
 
 from __future__ import annotations
 
 import json
-import os
 import statistics
 import sys
 import time
 from collections.abc import Callable
 from functools import partial
 from typing import Any
-
-os.environ.setdefault("LP_NUM_THREADS", "0")
 
 import numpy as np
 from vid2demo.envs.builtin import arm_trajectory, builtin_reference

@@ -120,8 +120,8 @@ def _gl_context() -> Any:
     """This thread's graphics context, shared by all surfaces: only the first one costs a fifth of a second."""
     # A child process must not draw with its parent's.
     if getattr(_of_thread, "process", None) != os.getpid():
-        # Mesa's rasterizer draws in threads of its own: a process that is forked lacks them and waits for them for ever,
-        # and many environments at once crowd each other out.
+        # Mesa's rasterizer draws in threads of its own: a forked process lacks them and waits for them for ever, and
+        # many environments at once crowd each other out.
         os.environ.setdefault("LP_NUM_THREADS", "0")
         load_mujoco()  # without a screen MuJoCo's own choice of back end would end the process
         try:
