@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import json
 import os
+import re
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
@@ -17,10 +18,9 @@ from tyro.conf import Positional, arg
 
 from . import __version__
 from .extract.errors import UserError
-from .extract.files import atomic_path, write_json
 from .extract.progress import Terminal
 from .extract.stages import Stage, plain, run_stages
-from .extract.wording import as_lines, measures_of
+from .extract.wording import as_lines
 
 Box = tuple[float, float, float, float]
 Result = Mapping[str, Any]
@@ -32,6 +32,7 @@ def told(metavar: str | None, text: str) -> Any:
 
 
 ReferenceFile = Annotated[Path, arg(metavar="REFERENCE", help="A *.reference.npz, as `retarget` writes it.")]
+MeshUnit = Annotated[Literal["auto", "m", "cm", "mm", "in"], arg(help="Unit of length of --mesh.")]
 Out = Annotated[Path, arg(metavar="DIR", help="Folder for the results; an interrupted command goes on in it.")]
 Seed = Annotated[int, arg(metavar="N", help="Seed of every random draw [integer].")]
 Episodes = Annotated[int, arg(metavar="N", help="Successful demonstrations to collect [count].")]
@@ -94,17 +95,15 @@ class FromVideo(Staged):
         str | None,
         told("NAME", "What is poured into, such as mug. Default: not followed; one stands under the lip."),
     ] = None
-    box: Annotated[Box | None, told("X Y W H", "The object's box in the first frame [px]. Default: found.")] = None
-    receptacle_box: Annotated[
-        Box | None, told("X Y W H", "The receptacle's box in the first frame [px]. Default: found.")
-    ] = None
-    camera: Annotated[
-        Box | None, told("FX FY CX CY", "Camera intrinsics [px]. Default: f = sqrt(w^2 + h^2), centred.")
-    ] = None
-    mesh: Annotated[
-        Path | None, told("FILE", "Your mesh of the object (obj, ply, stl, glb). Default: the library's.")
-    ] = None
-    mesh_unit: Annotated[Literal["auto", "m", "cm", "mm", "in"], arg(help="Unit of length of --mesh.")] = "auto"
+    box: Annotated[Box | None, told("X Y W H", "The object's box in the start frame [px]. Default: found.")] = None
+    receptacle_box: Annotated[Box | None, told("X Y W H", "The receptacle's box there [px]. Default: found.")] = None
+    camera: Annotated[Box | None, told("FX FY CX CY", "Intrinsics [px]. Default: f = sqrt(w^2 + h^2), centred.")] = None
+    mesh: Annotated[Path | None, told("FILE", "Your mesh: obj, ply, stl, glb. Default: the library's.")] = None
+    mesh_unit: MeshUnit = "auto"
+    mask: Annotated[Path | None, told("PNG", "The object in the start frame, white on black. Default: cut.")] = None
+    start_frame: Annotated[int | None, told("N", "Frame of box and mask; followed both ways. Default: chosen.")] = None
+    camera_motion: Annotated[Literal["auto", "static", "moving"], arg(help="Whether the camera moves.")] = "auto"
+    rerun: Annotated[bool, told(None, "Write extract.rrd as well, for the Rerun viewer.")] = False
     seed: Seed = 0
 
     def settings(self, scale: float | Literal["auto"] = "auto", episodes: int = 0) -> Any:
@@ -112,9 +111,12 @@ class FromVideo(Staged):
 
         return RunSettings(
             self.video,
-            ObjectSettings(self.object, self.box, self.mesh, self.mesh_unit),
+            ObjectSettings(self.object, self.box, self.mesh, self.mesh_unit, self.mask),
             ObjectSettings(self.receptacle, self.receptacle_box) if self.receptacle else None,
             camera=self.camera,
+            start_frame=self.start_frame,
+            camera_motion=self.camera_motion,
+            rerun=self.rerun,
             scale=scale,
             episodes=episodes,
             seed=self.seed,
@@ -152,6 +154,33 @@ class Extract(FromVideo):
 
         settings, identity = self.settings(), video_identity(self.video)
         return self.do_stages([extract_stage(settings, self.out)], settings_record(settings), identity)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompareTrack(Command):
+    """Measure a track against the truth: the paper's errors of motion, and errors of single poses.
+
+    For example: vid2demo compare-track runs/coffee/kettle.track.npz truth.npz --mesh kettle.obj --mesh-unit mm
+    """
+
+    estimate: Positional[Annotated[Path, arg(metavar="ESTIMATE", help="A *.track.npz, as `extract` writes it.")]]
+    truth: Positional[Annotated[Path, arg(metavar="TRUTH", help="A track, or an npz of its arrays; see the README.")]]
+    mesh: Annotated[Path | None, told("FILE", "The object's mesh in the truth's frame. Default: no ADD.")] = None
+    mesh_unit: MeshUnit = "auto"
+    symmetry_order: Annotated[
+        int | None, told("N", "Turns about +z that look the same, 0 for any [count]. Default: the truth's own.")
+    ] = None
+    out: Annotated[Path | None, told("FILE", "Write the figures to this JSON file. Default: only print.")] = None
+
+    def do(self) -> Result:
+        from .extract.compare import compare_files
+
+        return compare_files(self.estimate, self.truth, self.mesh, self.mesh_unit, self.symmetry_order, self.out)
+
+    def words(self, result: Result) -> str:
+        from .extract.compare import Comparison
+
+        return Comparison.from_json(result).table()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -309,27 +338,9 @@ class Meshes(Command):
     seed: Annotated[int | None, told("N", "A seeded variant [integer]. Default: the nominal one.")] = None
 
     def do(self) -> Result:
-        from .extract.vessels import CATEGORIES, make_vessel, parameter_space, resolve_category
+        from .extract.catalogue import catalogue
 
-        if self.action == "list":
-            return {"categories": {category: measures_of(make_vessel(category)) for category in CATEGORIES}}
-        if self.name is None:
-            raise UserError(f"meshes {self.action} needs a category; the library has {', '.join(CATEGORIES)}")
-        vessel = make_vessel(category := resolve_category(self.name)[0], self.seed)
-        parameters = {
-            key: {"value": vessel.params[key], "low": r.low, "high": r.high, "unit": r.unit}
-            for key, r in parameter_space(category).items()
-        }
-        shown: dict[str, Any] = {"category": category, "measures": measures_of(vessel), "parameters": parameters}
-        if self.action == "show":
-            return shown
-        if self.out is None:
-            raise UserError("meshes export needs --out DIR, the folder to write to")
-        file = self.out / f"{category if self.seed is None else f'{category}_{self.seed}'}.{self.format}"
-        with atomic_path(file) as temporary:
-            vessel.mesh.export(temporary)
-        write_json(file.with_suffix(".json"), shown)
-        return {"mesh": str(file), "description": str(file.with_suffix(".json"))}
+        return catalogue(self.action, self.name, self.seed, self.out, self.format)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -344,9 +355,7 @@ class Synthesize(Staged):
     seconds: Annotated[float, arg(metavar="S", help="Length of the clip [s].")] = 6.0
     fps: Annotated[float, arg(metavar="HZ", help="Frame rate [Hz].")] = 25.0
     size: Annotated[tuple[int, int], arg(metavar="W H", help="Size of the picture [px], even numbers.")] = (640, 480)
-    without_hand: Annotated[
-        bool, arg(help="Leave out the hand that hides a part of the vessel.", help_behavior_hint="")
-    ] = False
+    without_hand: Annotated[bool, told(None, "Leave out the hand that hides a part of the vessel.")] = False
     seed: Seed = 0
 
     def do(self) -> Result:
@@ -372,33 +381,23 @@ class Demo(Staged):
     seed: Seed = 0
 
     def do(self) -> Result:
-        from .run import ObjectSettings, RunSettings, run
+        from .run import demo
 
+        chosen: dict[str, Any] = {"category": self.category, "receptacle": self.receptacle, "seed": self.seed}
         clip = self.out / "clip"
-        chosen: dict[str, Any] = {"category": self.category, "receptacle": self.receptacle, "seconds": self.seconds}
-        Synthesize(out=clip, seed=self.seed, force=self.force, **chosen).do()
-        truth = json.loads((clip / "settings.json").read_text(encoding="utf-8"))
-        camera, box = truth["camera_matrix"], truth["boxes_xywh_px"]["receptacle"]
-        settings = RunSettings(
-            clip / "video.mp4",
-            ObjectSettings(self.category),
-            ObjectSettings(self.receptacle, (box[0], box[1], box[2], box[3])),
-            camera=(camera[0][0], camera[1][1], camera[0][2], camera[1][2]),
-            episodes=self.episodes,
-            seed=self.seed,
-        )
-        return run(settings, self.out, force=self.force, listener=Terminal())
+        Synthesize(out=clip, force=self.force, seconds=self.seconds, **chosen).do()
+        return demo(clip, self.out, **chosen, episodes=self.episodes, force=self.force, listener=Terminal())
 
 
 COMMANDS: dict[str, type[Command]] = {
-    c.__name__.lower(): c
-    for c in (Run, Extract, Retarget, Simulate, Play, Collect, Replay, Report, Meshes, Synthesize, Demo)
+    re.sub(r"(?<!^)(?=[A-Z])", "-", c.__name__).lower(): c
+    for c in (Run, Extract, CompareTrack, Retarget, Simulate, Play, Collect, Replay, Report, Meshes, Synthesize, Demo)
 }
 
 
 def usage() -> str:
     """What `vid2demo --help` prints."""
-    commands = "\n".join(f"  {name:<11} {(c.__doc__ or '').splitlines()[0]}" for name, c in COMMANDS.items())
+    commands = "\n".join(f"  {name:<13} {(c.__doc__ or '').splitlines()[0]}" for name, c in COMMANDS.items())
     return f"""usage: vid2demo COMMAND [options]
 
 A video of a person pouring in; a robot environment, verified robot demonstrations and a report out.

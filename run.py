@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -12,6 +13,7 @@ from .extract.errors import UserError
 from .extract.files import sha256_of_file, write_json
 from .extract.progress import Listener, Progress
 from .extract.stages import PACKAGE_ROOT, Stage, StageError, plain, run_stages
+from .extract.wording import symmetry_in_words
 
 _ALL = ("extract", "envs", "demos")
 
@@ -21,24 +23,34 @@ class ObjectSettings:
     """One object to follow.
 
     name: what it is called and, without a mesh, its category in the vessel library.
-    box_xywh_px: its box in the first frame, or None: found by the program.
+    box_xywh_px: its box in the start frame, or None: found by the program.
     mesh, mesh_unit: the user's own mesh file and its unit ("auto", "m", "cm", "mm", "in").
+    mask: picture of the object in the start frame, white on black.
     """
 
     name: str
     box_xywh_px: tuple[float, float, float, float] | None = None
     mesh: Path | None = None
     mesh_unit: str = "auto"
+    mask: Path | None = None
 
 
 @dataclass(frozen=True)
 class RunSettings:
-    """What `vid2demo run` is told. camera: (fx, fy, cx, cy) in px, or None: the focal prior."""
+    """What `vid2demo run` is told.
+
+    camera: (fx, fy, cx, cy) in px, or None: the focal prior.
+    start_frame: the frame that boxes and masks belong to, or None: the first, or the best where none are given.
+    rerun: whether to write extract.rrd.
+    """
 
     video: Path
     object: ObjectSettings
     receptacle: ObjectSettings | None = None
     camera: tuple[float, float, float, float] | None = None
+    start_frame: int | None = None
+    camera_motion: Literal["auto", "static", "moving"] = "auto"
+    rerun: bool = False
     scale: float | Literal["auto"] = "auto"
     episodes: int = 10
     seed: int = 0
@@ -88,30 +100,52 @@ def extract_stage(settings: RunSettings, folder: Path) -> Stage:
     def work(progress: Progress) -> Mapping[str, Any]:
         from .extract.perceive import ObjectRequest, extract
 
-        requests = [ObjectRequest(o.name, o.box_xywh_px, o.mesh, o.mesh_unit) for o in objects]
+        requests = [ObjectRequest(o.name, o.box_xywh_px, o.mesh, o.mesh_unit, o.mask) for o in objects]
         tracks = extract(
-            settings.video, requests, camera=settings.camera, out=folder, seed=settings.seed, progress=progress
+            settings.video,
+            requests,
+            camera=settings.camera,
+            start_frame=settings.start_frame,
+            camera_motion=settings.camera_motion,
+            rerun=settings.rerun,
+            out=folder,
+            seed=settings.seed,
+            progress=progress,
         )
-        return {
-            name: {
-                "frames": len(track),
-                "visible_fraction": float(track.visible.mean()),
-                "mean_confidence": float(track.confidence.mean()),
-                "mesh": track.header.get("mesh", {}).get("name"),
-            }
-            for name, track in tracks.items()
-        }
+        return {name: _track_figures(track) for name, track in tracks.items()}
 
+    told = {"objects": [asdict(o) | {"mesh": None, "mask": None} for o in objects], "camera": settings.camera}
+    told |= {"start_frame": settings.start_frame, "camera_motion": settings.camera_motion, "seed": settings.seed}
+    files = {f"mesh of {o.name}": o.mesh for o in objects if o.mesh is not None}
+    files |= {f"mask of {o.name}": o.mask for o in objects if o.mask is not None}
+    outputs = [f"{o.name}.{kind}" for o in objects for kind in ("track.npz", "masks.npz", "mask.png")]
+    outputs += ["overlay.mp4", *(["extract.rrd"] if settings.rerun else [])]
     return Stage(
         "extract",
         "follow the objects in the video",
         work,
-        plain({"objects": [asdict(o) | {"mesh": None} for o in objects], "camera": settings.camera})
-        | {"seed": settings.seed},
-        {"video": settings.video} | {f"mesh of {o.name}": o.mesh for o in objects if o.mesh is not None},
-        (*(f"{o.name}.{kind}" for o in objects for kind in ("track.npz", "mask.png")), "overlay.mp4"),
+        plain(told),
+        {"video": settings.video} | files,
+        tuple(outputs),
         ("extract",),
     )
+
+
+def _track_figures(track: Any) -> dict[str, Any]:
+    """What a person wants to know of an ObjectTrack at once."""
+    mesh, how = track.header.get("mesh", {}), track.header["settings"]
+    figures = {
+        "frames": len(track),
+        "visible_fraction": float(track.visible.mean()),
+        "mean_confidence": float(track.confidence.mean()),
+        "mesh": mesh.get("name"),
+        "place": f"{how['choice']}, box {' '.join(f'{v:g}' for v in how['box_xywh_px'])} in frame {how['start_frame']}",
+        "symmetry": symmetry_in_words(mesh["symmetry"]["order"]),
+    }
+    faces = mesh.get("faces", {})
+    if faces and faces["tracked"] < faces["in_file"]:
+        figures["decimated"] = f"{faces['in_file']} faces in the file, {faces['tracked']} tracked"
+    return figures
 
 
 def reference_stage(
@@ -286,6 +320,31 @@ def run(
         from .report import write_report
 
         raise UserError(f"{error}; what was done so far is in {write_report(folder)}") from error
+
+
+def demo(
+    clip: Path,
+    folder: Path,
+    *,
+    category: str,
+    receptacle: str,
+    seed: int,
+    episodes: int,
+    force: bool = False,
+    listener: Listener | None = None,
+) -> dict[str, Any]:
+    """`run` on a clip that `synthesize` wrote, told no more of it than a person could tell."""
+    truth = json.loads((clip / "settings.json").read_text(encoding="utf-8"))
+    camera, box = truth["camera_matrix"], truth["boxes_xywh_px"]["receptacle"]
+    settings = RunSettings(
+        clip / "video.mp4",
+        ObjectSettings(category),
+        ObjectSettings(receptacle, (box[0], box[1], box[2], box[3])),
+        camera=(camera[0][0], camera[1][1], camera[0][2], camera[1][2]),
+        episodes=episodes,
+        seed=seed,
+    )
+    return run(settings, folder, force=force, listener=listener)
 
 
 def _stem(path: Path) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import zipfile
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,11 @@ class Comparison:
 
     def to_json(self) -> dict[str, Any]:
         return asdict(self)
+
+    @staticmethod
+    def from_json(value: Mapping[str, Any]) -> Comparison:
+        velocity = {name: VelocityErrors(**errors) for name, errors in value["velocity"].items()}
+        return Comparison(value["frames"], value["visible_frames"], velocity, PoseErrors(**value["pose"]))
 
     def table(self) -> str:
         """The same for a reader."""
@@ -171,3 +177,25 @@ def write_comparison(comparison: Comparison, path: Path) -> None:
     from .files import write_json
 
     write_json(path, json.loads(json.dumps(comparison.to_json())))
+
+
+def compare_files(
+    estimate: Path, truth: Path, mesh: Path | None, mesh_unit: str, symmetry_order: int | None, out: Path | None
+) -> dict[str, Any]:
+    """Figures of a track against a truth, as `Comparison` holds them; written to `out` if given.
+
+    Raises UserError when a file is missing, damaged, or the two are of different recordings.
+    """
+    from .meshes import load_mesh
+
+    if symmetry_order is not None and symmetry_order < 0:
+        raise UserError(f"--symmetry-order {symmetry_order} is negative; give 1 for none, 0 for a body of revolution")
+    comparison = compare_tracks(
+        ObjectTrack.load(estimate),
+        load_truth(truth),
+        model=None if mesh is None else load_mesh(mesh, mesh_unit),
+        symmetry=None if symmetry_order is None else Symmetry(order=symmetry_order),
+    )
+    if out is not None:
+        write_comparison(comparison, out)
+    return comparison.to_json()

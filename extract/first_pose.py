@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
+import fast_simplification
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -26,6 +27,9 @@ EDGE_WEIGHT = 0.7
 BOX_WEIGHT = 1.2
 SEARCH_SIDE_PX = 72
 SEARCH_PAD = 0.25  # of the longer side, around the box
+SEARCH_FACES = 1000
+ROUNDS: tuple[tuple[int, tuple[float, ...]], ...] = ((40, (4.0, 2.0)), (14, (3.0, 2.0, 1.0)), (5, (1.0, 1.0)))
+"""How many poses are refined in every round, and the steps in px along the outline's lines there."""
 
 
 @dataclass(frozen=True)
@@ -83,16 +87,19 @@ def find_first_pose(
     symmetry: Symmetry = Symmetry(),  # noqa: B008 - frozen
     any_rotation: bool = True,
     stands: bool = True,
-    keep: int = 60,
 ) -> list[PoseCandidate]:
     """Poses that explain a mask, best first.
+
+    Every rotation is drawn small with few faces; the best and the best of other kinds are refined a little, and the
+    best of these to the end.
 
     box_xywh_px: box around the whole object; the mask's own when not given.
     symmetry: turns after which the mesh looks the same need not be searched.
     any_rotation: also try rotations that are not upright (600 of them, spread over SO(3)).
     stands: whether the object is likely to stand on its -z.
     """
-    yaws = np.arange(0.0, 360.0 / symmetry.order, 10.0) if symmetry.order else (0.0,)
+    turns = symmetry.order if abs(symmetry.axis[2]) > 0.99 else 1
+    yaws = np.arange(0.0, 360.0 / turns, 10.0) if turns else (0.0,)
     tries = [upright_rotation(e, float(yaw)) for e in ELEVATIONS_DEG for yaw in yaws]
     if any_rotation:
         tries += list(super_fibonacci_rotations(600))
@@ -101,22 +108,26 @@ def find_first_pose(
     small_mask, small_camera = _shrunk(mask, camera_matrix, box, scale)
     pad_px = SEARCH_PAD * SEARCH_SIDE_PX
     small_box = (pad_px, pad_px, box[2] * scale, box[3] * scale)
-    coarse = []
+    light = _with_few_faces(mesh)
+    found = []
     for R in tries:
-        T = _placed(mesh, R, small_camera, small_box)
-        coarse.append(PoseCandidate(T, *silhouette_ious(mesh, T, small_camera, small_mask, small_box), stands=stands))
-    coarse.sort(key=lambda c: c.merit, reverse=True)
-    coarse = coarse[: keep // 5] + distinct(coarse[keep // 5 :], 15, keep - keep // 5, np.inf, symmetry)
+        T = _placed(light, R, small_camera, small_box)
+        found.append(PoseCandidate(T, *silhouette_ious(light, T, small_camera, small_mask, small_box), stands=stands))
+    found.sort(key=lambda c: c.merit, reverse=True)
 
     bins, colours = mask_evidence(mask)
-    found = []
-    for candidate in coarse:
-        result = refine(
-            mesh, candidate.T_camera_object, camera_matrix, bins, colours, steps_px=(4, 3, 2, 1),
-            prior_rotation_rad=0.12, prior_translation=0.05, prior_depth=0.1,
-        )  # fmt: skip
-        found.append(judge(mesh, result.T_camera_object, camera_matrix, rgb, mask, box, stands))
-    found.sort(key=lambda c: c.merit, reverse=True)
+    edges = edge_strength(rgb)
+    for count, steps_px in ROUNDS:
+        first = count // 5
+        chosen = found[:first] + distinct(found[first:], 15, count - first, np.inf, symmetry)
+        found = []
+        for candidate in chosen:
+            result = refine(
+                mesh, candidate.T_camera_object, camera_matrix, bins, colours, steps_px=steps_px,
+                prior_rotation_rad=0.12, prior_translation=0.05, prior_depth=0.1,
+            )  # fmt: skip
+            found.append(judge(mesh, result.T_camera_object, camera_matrix, edges, mask, box, stands))
+        found.sort(key=lambda c: c.merit, reverse=True)
     return found
 
 
@@ -124,14 +135,14 @@ def judge(
     mesh: TrackingMesh,
     T_camera_object: Array,
     camera_matrix: Array,
-    rgb: Image,
+    edges: NDArray[np.float32],
     mask: Mask,
     box: Box,
     stands: bool = True,
 ) -> PoseCandidate:
-    """How well a pose explains an image, the mask cut from it and the box around the object."""
+    """How well a pose explains the edges of an image, the mask cut from it and the box around the object."""
     ious = silhouette_ious(mesh, T_camera_object, camera_matrix, mask, box)
-    edge = edge_score(mesh, T_camera_object, camera_matrix, edge_strength(rgb))
+    edge = edge_score(mesh, T_camera_object, camera_matrix, edges)
     return PoseCandidate(T_camera_object, *ious, edge, stands)
 
 
@@ -139,12 +150,16 @@ def distinct(
     candidates: Sequence[PoseCandidate], apart_deg: float, count: int, within: float, symmetry: Symmetry
 ) -> list[PoseCandidate]:
     """The best candidates at least `apart_deg` from each other, none worse than the best by more than `within`."""
+    if not candidates:
+        return []
+    rotations = np.stack([candidate.T_camera_object[:3, :3] for candidate in candidates])
     kept: list[PoseCandidate] = []
-    for candidate in candidates:
-        R = candidate.T_camera_object[:3, :3]
-        far = all(np.rad2deg(symmetry.error_rad(R, k.T_camera_object[:3, :3])) > apart_deg for k in kept)
-        if far and candidate.merit > candidates[0].merit - within and len(kept) < count:
-            kept.append(candidate)
+    far = np.array([candidate.merit > candidates[0].merit - within for candidate in candidates])
+    while far.any() and len(kept) < count:
+        k = int(np.argmax(far))  # the first, and so the best, that is far from all taken
+        kept.append(candidates[k])
+        far &= np.rad2deg(symmetry.error_rad(rotations, rotations[k])) > apart_deg
+        far[: k + 1] = False
     return kept
 
 
@@ -186,6 +201,13 @@ def share_on_edges(outline: Outline, strength: NDArray[np.float32]) -> float:
         along = np.abs(np.sum(strength[y * inside, x * inside] * outline.normal, axis=1))
         best = np.maximum(best, np.where(inside, along, 0.0))
     return float(np.mean(np.minimum(best, 1.0)))
+
+
+def _with_few_faces(mesh: TrackingMesh) -> TrackingMesh:
+    if len(mesh.faces) <= SEARCH_FACES:
+        return mesh
+    vertices, faces = fast_simplification.simplify(mesh.vertices_m, mesh.faces, target_count=SEARCH_FACES)[:2]
+    return TrackingMesh.build(np.asarray(vertices, float), np.asarray(faces, np.int32))
 
 
 def _placed(mesh: TrackingMesh, R: Array, camera_matrix: Array, box: Box) -> Array:

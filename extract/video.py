@@ -8,7 +8,7 @@ one clear error at the start and not a short track at the end.
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from fractions import Fraction
@@ -30,6 +30,8 @@ Image = NDArray[np.uint8]
 # A few broken packets are common at the start of clips cut from a longer recording; more means a damaged file.
 MAX_BROKEN_FRACTION = 0.02
 REORDER_DEPTH = 8
+PIECE_FRAMES = 64  # held in memory at once when a clip is read backward
+_SAME_S = 1e-7
 _CLOCK_HZ = 90_000
 
 
@@ -110,15 +112,14 @@ def read_video_info(path: Path) -> VideoInfo:
     return VideoInfo(path, width_px, height_px, times - times[0], _rotation_deg(first), sha256_of_file(path))
 
 
-def iterate_frames(path: Path, max_side_px: int | None = None) -> Iterator[Frame]:
+def iterate_frames(path: Path, max_side_px: int | None = None, info: VideoInfo | None = None) -> Iterator[Frame]:
     """Yield the frames of a video in presentation order, shrunk so that the longer side is at most `max_side_px`.
 
+    info: from `read_video_info`, which is called when it is not given.
     Frames that cannot be decoded and frames whose time does not advance are left out. Raises UserError when more
     than MAX_BROKEN_FRACTION of the file's frames cannot be decoded.
     """
-    info = read_video_info(path)
-    scale = 1.0 if max_side_px is None else min(1.0, max_side_px / max(info.width_px, info.height_px))
-    size = (round(info.width_px * scale), round(info.height_px * scale))
+    info = info or read_video_info(path)
     count, last_s, start_s = 0, -np.inf, None
     for frame in _decode(info.path):
         time_s = float(frame.time or 0.0)
@@ -126,13 +127,31 @@ def iterate_frames(path: Path, max_side_px: int | None = None) -> Iterator[Frame
         if time_s <= last_s:
             continue
         last_s = time_s
-        rgb = _upright(frame)
-        if scale < 1.0:
-            rgb = np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
-        yield Frame(count, time_s - start_s, rgb)
+        yield Frame(count, time_s - start_s, _shrunk(_upright(frame), max_side_px))
         count += 1
     if count < info.frame_count * (1 - MAX_BROKEN_FRACTION) - 1:
         raise UserError(f"video {path} is damaged: {count} of {info.frame_count} frames can be decoded; copy it again")
+
+
+def iterate_backward(path: Path, time_s: Sequence[float], max_side_px: int | None = None) -> Iterator[Frame]:
+    """Yield the first frames of a video from the last of them to the first, a piece at a time in memory.
+
+    time_s: (N,) times of the first N frames, as `iterate_frames` gave them.
+    Raises UserError when one of them cannot be decoded any more.
+    """
+    origin = next(_decode(path), None)
+    start_s = 0.0 if origin is None else float(origin.time or 0.0)
+    for end in range(len(time_s), 0, -PIECE_FRAMES):
+        begin = max(0, end - PIECE_FRAMES)
+        wanted = [start_s + t for t in time_s[begin:end]]
+        # Not every file can be entered everywhere: what is missing then is read from the beginning.
+        piece = _pick(_decode(path, wanted[0]), wanted, max_side_px)
+        if len(piece) < len(wanted):
+            piece = _pick(_decode(path), wanted, max_side_px)
+        if len(piece) < len(wanted):
+            raise UserError(f"video {path} changed while it was read, or cannot be decoded twice the same; copy it")
+        for k in range(end - 1, begin - 1, -1):
+            yield Frame(k, time_s[k], piece.pop(k - begin))
 
 
 class VideoWriter:
@@ -181,10 +200,34 @@ class VideoWriter:
         return self._resources.__exit__(kind, error, trace)
 
 
-def _decode(path: Path) -> Iterator[VideoFrame]:
+def _pick(frames: Iterator[VideoFrame], wanted_s: Sequence[float], max_side_px: int | None) -> dict[int, Image]:
+    """The pictures of the frames with the times wanted (ascending), by place in `wanted_s`."""
+    picked: dict[int, Image] = {}
+    for frame in frames:
+        time_s = float(frame.time or 0.0)
+        if time_s > wanted_s[-1] + _SAME_S:
+            break
+        place = int(np.searchsorted(wanted_s, time_s - _SAME_S))
+        if place < len(wanted_s) and abs(wanted_s[place] - time_s) <= _SAME_S and place not in picked:
+            picked[place] = _shrunk(_upright(frame), max_side_px)
+    return picked
+
+
+def _shrunk(rgb: Image, max_side_px: int | None) -> Image:
+    scale = 1.0 if max_side_px is None else max_side_px / max(rgb.shape[:2])
+    if scale >= 1.0:
+        return rgb
+    size = (round(rgb.shape[1] * scale), round(rgb.shape[0] * scale))
+    return np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _decode(path: Path, from_s: float | None = None) -> Iterator[VideoFrame]:
+    """Frames by time; with `from_s`, from the last place before it where decoding can begin."""
     with av.open(str(path)) as container:
         stream = container.streams.video[0]
         stream.thread_type = "AUTO"
+        if from_s is not None:
+            container.seek(int(from_s / float(stream.time_base or Fraction(1, _CLOCK_HZ))), stream=stream)
         # Streams cut from a longer recording can announce too small a reorder depth, and FFmpeg then hands frames
         # out of order: a small heap puts them right.
         waiting: list[tuple[float, int, VideoFrame]] = []

@@ -13,8 +13,13 @@ def measures_of(vessel: Any) -> dict[str, Any]:
         "interior_ml": round(1e6 * vessel.interior_volume_m3),
         "mass_g": round(1e3 * vessel.mass_kg),
         "outlet": vessel.outlet.kind,
-        "symmetry": {0: "about z", 1: "none"}.get(vessel.symmetry.order, f"{vessel.symmetry.order}-fold about z"),
+        "symmetry": symmetry_in_words(vessel.symmetry.order),
     }
+
+
+def symmetry_in_words(order: int, axis: str = "z") -> str:
+    """Order of a rotational symmetry (0 = continuous, 1 = none) for a reader."""
+    return {0: f"about {axis}", 1: "none"}.get(order, f"{order}-fold about {axis}")
 
 
 def as_lines(value: Mapping[str, Any], depth: int = 0) -> list[str]:

@@ -46,7 +46,7 @@ def test_help_names_every_command_and_begins_at_once() -> None:
 
 def test_commands_of_the_design_are_there() -> None:
     wanted = {"run", "extract", "retarget", "simulate", "play", "collect", "replay", "meshes", "synthesize", "report"}
-    assert set(cli.COMMANDS) == {*wanted, "demo"}
+    assert set(cli.COMMANDS) == {*wanted, "demo", "compare-track"}
 
 
 @pytest.mark.parametrize("name", list(cli.COMMANDS))
@@ -60,7 +60,7 @@ def test_help_of_each_command_has_an_example_and_tells_every_option(
     assert f"For example: vid2demo {name}" in text
     for option, hint in typing.get_type_hints(cli.COMMANDS[name], include_extras=True).items():
         assert "help='" in repr(hint) or 'help="' in repr(hint), f"{option} has no help"
-    if name not in ("play", "replay", "report", "meshes"):
+    if name not in ("play", "replay", "report", "meshes", "compare-track"):
         assert "--out DIR" in text
         assert "--force" in text
     assert "--json" in text

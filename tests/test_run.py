@@ -34,8 +34,8 @@ def test_every_stage_reads_what_the_ones_before_wrote(tmp_path: Path) -> None:
         assert set(stage.inputs.values()) <= there, stage.name
         there |= {tmp_path / name for name in stage.outputs}
     wanted = (
-        "kettle.track.npz mug.track.npz kettle.mask.png mug.mask.png overlay.mp4 kettle.reference.npz "
-        "kettle.joints.npz feasibility.json simulation.mp4 series.json dataset report.html"
+        "kettle.track.npz mug.track.npz kettle.masks.npz mug.masks.npz kettle.mask.png mug.mask.png overlay.mp4 "
+        "kettle.reference.npz kettle.joints.npz feasibility.json simulation.mp4 series.json dataset report.html"
     )
     assert {path.name for path in there - {KETTLE.video}} == set(wanted.split())
 
@@ -52,6 +52,9 @@ def test_report_reads_everything(tmp_path: Path) -> None:
         {"object": ObjectSettings("kettle", mesh_unit="mm")},
         {"camera": (500.0, 500.0, 320.0, 240.0)},
         {"seed": 1},
+        {"start_frame": 3},
+        {"camera_motion": "moving"},
+        {"rerun": True},
         {"receptacle": None},
     ],
 )
@@ -79,6 +82,16 @@ def test_the_user_s_mesh_is_read_by_content(tmp_path: Path) -> None:
     settings = dataclasses.replace(KETTLE, video=video, object=ObjectSettings("kettle", mesh=mesh))
     before = extract_stage(settings, tmp_path).key()
     mesh.write_bytes(b"another shape")
+    assert extract_stage(settings, tmp_path).key() != before
+
+
+def test_the_mask_is_read_by_content(tmp_path: Path) -> None:
+    video, mask = tmp_path / "coffee.mp4", tmp_path / "kettle.png"
+    video.write_bytes(b"frames")
+    mask.write_bytes(b"one mask")
+    settings = dataclasses.replace(KETTLE, video=video, object=ObjectSettings("kettle", mask=mask))
+    before = extract_stage(settings, tmp_path).key()
+    mask.write_bytes(b"another mask")
     assert extract_stage(settings, tmp_path).key() != before
 
 

@@ -291,7 +291,7 @@ def test_extract_writes_a_track_that_hugs_the_object(clip: Path, mesh, tmp_path:
         clip, [ObjectRequest("mug", box)], out=tmp_path, progress=lambda d, total, _: done.append((d, total))
     )
     track = tracks["mug"]
-    assert {p.name for p in tmp_path.iterdir()} == {"mug.track.npz", "mug.mask.png", "overlay.mp4"}
+    assert {p.name for p in tmp_path.iterdir()} == {"mug.track.npz", "mug.masks.npz", "mug.mask.png", "overlay.mp4"}
     assert len(track) == 12
     assert track.header["camera"]["source"] == "prior"
     assert track.header["settings"]["box_source"] == "given"

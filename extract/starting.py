@@ -1,0 +1,204 @@
+"""Where an object is and how it is turned in the frame that its track starts from, with what else it might be.
+
+Candidate meshes are compared by the first poses they allow, the best few are carried on with the vessel's shape fitted
+to the picture. What explains the picture nearly as well but is turned otherwise is kept beside the best.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from .candidates import Model, ObjectRequest, vessel_model
+from .errors import UserError
+from .first_pose import PoseCandidate, distinct, find_first_pose, judge
+from .geometry import Array
+from .raster import render_depth
+from .region import TrackingMesh, edge_strength, mask_evidence
+from .segment import Box, Mask, mask_box, mask_from_box, mask_from_silhouette
+from .shape_fit import View, coloured, fit_shape
+from .video import Image
+
+WORKING_SIDE_PX = 640  # tracking
+STARTING_SIDE_PX = 1280  # the first frame, where thin parts such as spouts must be seen to be fitted
+FOUND_IOU = 0.45  # below this no pose of the mesh explains what was cut out of the first frame
+HYPOTHESES = 4  # first poses, far from each other, that a shape is fitted to
+HYPOTHESES_WITHIN = 0.5  # of the best one's merit
+APART_DEG = 40.0
+RIVAL_WITHIN = 0.2  # of the best one's merit: nearly as good
+FLAT_GREY_LEVELS = 2.0  # standard deviation in the box, below which there is nothing to see
+FIT_ROUNDS = 3  # of cutting the mask near the silhouette and fitting the shape to it
+RECUT_BAND = 0.03  # of the object's size in the image
+
+
+class NotFoundError(UserError):
+    """The object is not where it was looked for."""
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """One explanation of the start frame: mesh, pose, and the object's mask at the starting resolution."""
+
+    model: Model
+    pose: PoseCandidate
+    mask: Mask
+    box: Box
+
+
+@dataclass(frozen=True)
+class Start:
+    """An object in the start frame, at the starting resolution: its explanations, best first.
+
+    box_source: "given", "mask" or "found".
+    """
+
+    hypotheses: tuple[Hypothesis, ...]
+    box_source: str
+
+    @property
+    def best(self) -> Hypothesis:
+        return self.hypotheses[0]
+
+    def described(self) -> dict[str, Any]:
+        """For the track's header: how well the best explains the picture, and what else was nearly as good."""
+        best, *others = self.hypotheses
+        symmetry, R = best.model.symmetry, best.pose.T_camera_object[:3, :3]
+        return {
+            "iou": round(best.pose.iou, 4),
+            "edge": round(best.pose.edge, 4),
+            "merit": round(best.pose.merit, 4),
+            "alternatives": [
+                {
+                    "mesh": other.model.header["name"],
+                    "merit": round(other.pose.merit, 4),
+                    "apart_deg": round(float(np.rad2deg(symmetry.error_rad(R, other.pose.T_camera_object[:3, :3]))), 1),
+                    "T_camera_object": np.round(other.pose.T_camera_object, 6).tolist(),
+                }
+                for other in others
+            ],
+        }
+
+    def preferring(self, index: int) -> Start:
+        """The same with another hypothesis put first."""
+        chosen = self.hypotheses[index]
+        return Start((chosen, *(h for h in self.hypotheses if h is not chosen)), self.box_source)
+
+
+def start_object(
+    request: ObjectRequest,
+    candidates: Sequence[Model],
+    rgb: Image,
+    box: Box,
+    source: str,
+    camera_matrix: Array,
+    mask: Mask | None = None,
+) -> Start:
+    """Choose among the candidate meshes, then fit pose and shape to the start frame.
+
+    rgb, box, camera_matrix and mask (cut from the box when None) are at the starting resolution.
+    Raises NotFoundError when no pose of any candidate explains what is there.
+    """
+    x, y, w, h = (round(v) for v in box)
+    if rgb[y : y + h, x : x + w].std(axis=(0, 1)).max() < FLAT_GREY_LEVELS:
+        raise NotFoundError(f"object {request.name!r} was not found: the frame is of one colour there")
+    # Coarse first: at full sharpness highlights and texture tear the mask apart.
+    shrink = min(1.0, WORKING_SIDE_PX / max(rgb.shape[:2]))
+    small = np.asarray(cv2.resize(rgb, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA), np.uint8)
+    small_box, small_camera = scaled(box, shrink), np.diag([shrink, shrink, 1.0]) @ camera_matrix
+    small_mask = mask_from_box(small, small_box) if mask is None else resized(mask, small)
+    ranked: list[tuple[PoseCandidate, Model]] = []
+    for model in candidates:
+        poses = find_first_pose(
+            model.mesh, small, small_mask, small_camera, box_xywh_px=small_box,
+            symmetry=model.symmetry, stands=model.vessel is not None,
+        )  # fmt: skip
+        ranked += [(pose, model) for pose in distinct(poses, APART_DEG, HYPOTHESES, HYPOTHESES_WITHIN, model.symmetry)]
+    ranked.sort(key=lambda entry: entry[0].merit, reverse=True)
+    if ranked[0][0].iou < FOUND_IOU:
+        raise NotFoundError(
+            f"object {request.name!r} was not found: the best silhouette covers only {ranked[0][0].iou:.0%} of what "
+            "was cut out of the frame"
+        )
+    edges = edge_strength(rgb)
+    band_px = max(3, round(RECUT_BAND * max(box[2], box[3])))
+    start_mask = resized(small_mask, rgb) if mask is None else mask
+    fits = [
+        _fitted(model, pose, rgb, edges, box, source, camera_matrix, band_px, start_mask)
+        for pose, model in ranked[:HYPOTHESES]
+    ]
+    fits.sort(key=lambda fit: fit[1].merit, reverse=True)
+    kept = distinct([pose for _, pose, _ in fits], APART_DEG, HYPOTHESES, RIVAL_WITHIN, fits[0][0].symmetry)
+    found = [_hypothesis(*fit, rgb, camera_matrix, band_px) for fit in fits if any(fit[1] is pose for pose in kept)]
+    return Start(tuple(found), source)
+
+
+def _hypothesis(
+    model: Model, pose: PoseCandidate, evidence: Mask, rgb: Image, camera_matrix: Array, band_px: int
+) -> Hypothesis:
+    T = pose.T_camera_object
+    silhouette = _silhouette(model.mesh, T, camera_matrix, rgb.shape)
+    mask = _evidence(model.mesh, rgb, T, camera_matrix, evidence, band_px) & silhouette
+    if model.vessel is not None:
+        model = vessel_model(coloured(model.vessel, rgb, mask))
+    return Hypothesis(model, pose, mask if mask.any() else silhouette, mask_box(silhouette))
+
+
+def _fitted(
+    model: Model,
+    pose: PoseCandidate,
+    rgb: Image,
+    edges: NDArray[np.float32],
+    box: Box,
+    source: str,
+    camera_matrix: Array,
+    band_px: int,
+    mask: Mask,
+) -> tuple[Model, PoseCandidate, Mask]:
+    """One hypothesis carried on: the vessel's shape and pose fitted to the mask re-cut near its silhouette."""
+    T = pose.T_camera_object
+    evidence = _evidence(model.mesh, rgb, T, camera_matrix, mask, band_px)
+    pose = judge(model.mesh, T, camera_matrix, edges, evidence, box, model.vessel is not None)
+    for _ in range(FIT_ROUNDS if model.vessel is not None else 0):
+        assert model.vessel is not None
+        view = View(*mask_evidence(evidence), T, box if source == "given" else None, edges)
+        vessel, (T_fitted,) = fit_shape(model.vessel, [view], camera_matrix)
+        fitted = vessel_model(vessel)
+        before = judge(model.mesh, T, camera_matrix, edges, evidence, box)
+        after = judge(fitted.mesh, T_fitted, camera_matrix, edges, evidence, box)
+        if after.merit <= before.merit + 0.002:
+            break  # a mask that lost a thin part misled the fit: edges and box tell
+        model, T, pose = fitted, T_fitted, after
+        evidence = _evidence(model.mesh, rgb, T, camera_matrix, evidence, band_px)
+    return model, pose, evidence
+
+
+def scaled(box: Box, scale: float) -> Box:
+    """A box in an image `scale` times as large."""
+    x, y, w, h = (v * scale for v in box)
+    return x, y, w, h
+
+
+def resized(mask: Mask, like: Image) -> Mask:
+    """A mask brought to the size of an image (H, W, 3)."""
+    size = (like.shape[1], like.shape[0])
+    return np.asarray(cv2.resize(mask.astype(np.uint8) * 255, size, interpolation=cv2.INTER_AREA) > 127)
+
+
+def _silhouette(mesh: TrackingMesh, T: Array, camera_matrix: Array, shape: tuple[int, ...]) -> Mask:
+    window = render_depth(mesh.vertices_m, mesh.faces, T, camera_matrix)
+    if window is None:
+        return np.zeros((shape[0], shape[1]), bool)
+    return window.mask_in_image(shape[1], shape[0])
+
+
+def _evidence(mesh: TrackingMesh, rgb: Image, T: Array, camera_matrix: Array, mask: Mask, band_px: int) -> Mask:
+    """The mask re-cut near the silhouette, with what the mask had there: re-cutting loses thin parts."""
+    silhouette = _silhouette(mesh, T, camera_matrix, mask.shape)
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * band_px + 1, 2 * band_px + 1))
+    near = cv2.dilate(silhouette.astype(np.uint8), kernel) > 0
+    return mask_from_silhouette(rgb, silhouette, band_px) | (mask & near)
