@@ -1,0 +1,229 @@
+"""Does the camera move, and how: read from the background, one frame at a time.
+
+Corners outside the objects are followed from a key frame by sparse optical flow there and back, and a homography is
+fitted to them robustly. It is exact for a camera that only turns and for a flat background; a hand-held camera's
+small sway is near enough to the first, a moving one in a deep scene is neither, which the quality tells. When a key
+frame has lost its corners the present frame takes its place; homographies are chained over key frames, not frames.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from .geometry import Array
+from .segment import Box, Mask
+from .video import Image
+
+WORKING_SIDE_PX = 640
+MOST_CORNERS = 400
+FEWEST_CORNERS = 25
+KEPT_SHARE = 0.45  # of a key frame's corners; with fewer the present frame becomes the key frame
+ROUND_TRIP_PX = 0.5
+INLIER_PX = 1.5
+STILL_PX, STILL_SHARE = 0.5, 0.3  # so many corners that have not moved mean a still camera: the others are things
+STATIC_SHARE = 0.004  # of the diagonal: background that never strays farther, in its 95th percentile, stands still
+OBJECT_MARGIN = 0.15  # of the box, left out around it: hands and shadows move with the object
+TURN_SHARE = 0.85  # of the corners that fit a homography: when so many fit a rotation too, it is a rotation
+
+
+@dataclass(frozen=True)
+class CameraMotion:
+    """How the camera moved against the first frame.
+
+    H_frame_first: (N, 3, 3) homographies in pixels of the video, from the first frame to each frame, H[2, 2] = 1.
+    R_camera_first: (N, 3, 3) the rotations that fit best: directions in the first camera's frame, in each one's.
+    quality: (N,) in [0, 1], share of the followed corners that agree with the homography; 0 where none could be
+        followed and the last motion was kept.
+    turn_quality: (N,) the same share for the rotation: much less for a camera that moves sideways.
+    static: the background stays where it was, to 0.4% of the diagonal, in 95% of the frames that could be judged;
+        also when none could, for want of anything to see there.
+    stray_px: how far the image's corners wander, 95th percentile over those frames, in px of the video.
+    rotates_only: not static, and a rotation explains the motion as well as a homography does.
+    """
+
+    H_frame_first: Array
+    R_camera_first: Array
+    quality: Array
+    turn_quality: Array
+    static: bool
+    stray_px: float
+    rotates_only: bool
+
+    @property
+    def R_first_camera(self) -> Array:
+        """(N, 3, 3) orientation of each frame's camera in the first frame's camera."""
+        return np.asarray(np.swapaxes(self.R_camera_first, 1, 2))
+
+
+def compensated(T_camera_object: Array, motion: CameraMotion) -> Array:
+    """T_first_camera_object (N, 4, 4): poses seen by the camera of the first frame, for a camera that turns in place.
+
+    T_camera_object: (N, 4, 4). Raises ValueError for another number of frames than the motion has.
+    """
+    if len(T_camera_object) != len(motion.R_camera_first):
+        raise ValueError(f"{len(T_camera_object)} poses, {len(motion.R_camera_first)} frames of camera motion")
+    out = np.array(T_camera_object, float)
+    out[:, :3] = motion.R_first_camera @ out[:, :3]
+    return out
+
+
+@dataclass
+class _KeyFrame:
+    """A frame that corners are followed from: its motion, how many corners it had, those left, then and now."""
+
+    H_key_first: Array
+    R_key_first: Array
+    grey: Image
+    count: int
+    start: NDArray[np.float32]
+    now: NDArray[np.float32]
+
+
+@dataclass
+class CameraWatch:
+    """Watches the background of a clip frame by frame; `result` may be asked for at any time.
+
+    camera_matrix: (3, 3) at the size of the frames given to `step`. Of each frame only its homography is kept.
+    """
+
+    camera_matrix: Array
+    _key: _KeyFrame | None = None
+    _before: Image | None = None
+    _shape: tuple[int, int] = (0, 0)
+    _scale: float = 1.0
+    _H: list[Array] = field(default_factory=list)
+    _R: list[Array] = field(default_factory=list)
+    _quality: list[tuple[float, float]] = field(default_factory=list)
+
+    def step(self, rgb: Image, leave_out: Mask | None = None, boxes: list[Box] | None = None) -> None:
+        """Take the next frame, (H, W, 3).
+
+        leave_out: (H, W) true where moving objects are; boxes: x, y, width, height of such objects, in px.
+        """
+        self._scale = min(1.0, WORKING_SIDE_PX / max(rgb.shape[:2]))
+        self._shape = (rgb.shape[0], rgb.shape[1])
+        grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+        if self._scale < 1.0:
+            grey = cv2.resize(grey, None, fx=self._scale, fy=self._scale, interpolation=cv2.INTER_AREA)
+        image = np.asarray(grey, np.uint8)
+        background = self._background(image, leave_out, boxes or [])
+        H, R, quality, turn_quality = np.eye(3), np.eye(3), 1.0, 1.0
+        if self._key is not None and self._before is not None:
+            H, R, quality, turn_quality = self._followed(self._key, self._before, image, background)
+        if self._key is None or quality == 0.0 or len(self._key.now) < KEPT_SHARE * self._key.count:
+            self._renew(H, R, image, background)
+        self._before = image
+        self._H.append(H)
+        self._R.append(R)
+        self._quality.append((quality, turn_quality))
+
+    def result(self) -> CameraMotion:
+        """The motion so far. Raises ValueError before the first frame."""
+        if not self._H:
+            raise ValueError("no frame was watched")
+        up = np.diag([1 / self._scale, 1 / self._scale, 1.0])
+        H = up @ np.stack(self._H) @ np.linalg.inv(up)
+        H /= H[:, 2:, 2:]
+        quality, turn_quality = np.array(self._quality).T
+        height, width = self._shape
+        corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], float)
+        stray = np.stack([np.linalg.norm(_moved(h, corners) - corners, axis=1).mean() for h in H])
+        judged = quality > 0
+        stray_px = float(np.percentile(stray[judged], 95)) if judged.any() else 0.0
+        static = stray_px <= STATIC_SHARE * float(np.hypot(width, height))
+        rotates_only = not static and bool(np.median(turn_quality[judged] / quality[judged]) >= TURN_SHARE)
+        return CameraMotion(H, np.stack(self._R), quality, turn_quality, static, stray_px, rotates_only)
+
+    def _background(self, image: Image, leave_out: Mask | None, boxes: list[Box]) -> Image:
+        """255 where corners may be looked for."""
+        height, width = image.shape
+        free = np.full((height, width), 255, np.uint8)
+        if leave_out is not None:
+            mask = cv2.resize(leave_out.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
+            radius = max(4, round(0.02 * max(height, width)))
+            free[cv2.dilate(mask, np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)) > 0] = 0
+        for box in boxes:
+            x, y, w, h = (v * self._scale for v in box)
+            mx, my = OBJECT_MARGIN * w, OBJECT_MARGIN * h
+            top, left = max(int(y - my), 0), max(int(x - mx), 0)
+            free[top : max(int(y + h + my), 0), left : max(int(x + w + mx), 0)] = 0
+        return free
+
+    def _followed(
+        self, key: _KeyFrame, before: Image, image: Image, background: Image
+    ) -> tuple[Array, Array, float, float]:
+        """Homography and rotation from the first frame and their qualities; forgets the corners that were lost."""
+        lost = self._H[-1], self._R[-1], 0.0, 0.0
+        if len(key.now) < FEWEST_CORNERS // 2:
+            return lost
+        now, there = _flow(before, image, key.now)
+        # The key frame decides, so that nothing drifts from frame to frame.
+        settled, back = _flow(image, key.grey, now, key.start)
+        height, width = image.shape
+        x, y = np.round(np.nan_to_num(now, nan=-1.0)).astype(int).T
+        inside = (x >= 0) & (y >= 0) & (x < width) & (y < height)
+        free = np.zeros(len(now), bool)
+        free[inside] = background[y[inside], x[inside]] > 0
+        good = there & back & free & (np.linalg.norm(settled - key.start, axis=1) < ROUND_TRIP_PX)
+        if good.sum() < FEWEST_CORNERS // 2:
+            return lost
+        key.start, key.now = key.start[good], now[good]
+        offset = np.linalg.norm(key.now - key.start, axis=1)
+        still = float(np.mean(offset < STILL_PX))
+        if still > STILL_SHARE and still * len(offset) >= FEWEST_CORNERS // 2:
+            share = float(np.mean(offset < INLIER_PX))
+            return key.H_key_first, key.R_key_first, share, share
+        fit: Any = cv2.findHomography(key.start, key.now, cv2.USAC_MAGSAC, INLIER_PX, maxIters=500, confidence=0.995)
+        H, inlier = fit
+        if H is None:
+            return lost
+        K = np.diag([self._scale, self._scale, 1.0]) @ self.camera_matrix
+        R, share = _rotation(key.start.astype(float), key.now.astype(float), K, inlier[:, 0] > 0)
+        quality = float(np.mean(inlier))
+        if share >= TURN_SHARE * quality:
+            # Three numbers instead of eight: a homography's perspective is mostly noise when the camera only turns.
+            H, quality = K @ R @ np.linalg.inv(K), share
+        H = np.asarray(H @ key.H_key_first)
+        return H / H[2, 2], R @ key.R_key_first, quality, share
+
+    def _renew(self, H: Array, R: Array, image: Image, background: Image) -> None:
+        spacing = max(4.0, 0.012 * max(image.shape))
+        corners = cv2.goodFeaturesToTrack(image, MOST_CORNERS, 0.005, spacing, mask=background, blockSize=5)
+        found = np.zeros((0, 2), np.float32) if corners is None else np.asarray(corners[:, 0], np.float32)
+        self._key = _KeyFrame(H, R, image, len(found), found, found.copy())
+
+
+def _flow(
+    a: Image, b: Image, points: NDArray[np.float32], guess: NDArray[np.float32] | None = None
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Where points (M, 2) of image a are in image b, and whether they were found there."""
+    begin = (points if guess is None else guess).reshape(-1, 1, 2).copy()
+    flags = 0 if guess is None else cv2.OPTFLOW_USE_INITIAL_FLOW
+    moved, status, _ = cv2.calcOpticalFlowPyrLK(
+        a, b, points.reshape(-1, 1, 2), begin, winSize=(15, 15), maxLevel=3, flags=flags
+    )
+    return np.asarray(moved[:, 0], np.float32), np.asarray(status[:, 0] > 0)
+
+
+def _moved(H: Array, pixels: Array) -> Array:
+    uvw = np.column_stack([pixels, np.ones(len(pixels))]) @ H.T
+    return np.asarray(uvw[:, :2] / uvw[:, 2:])
+
+
+def _rotation(start: Array, now: Array, K: Array, inlier: NDArray[np.bool_]) -> tuple[Array, float]:
+    """Rotation between two views (M, 2) px of far points, robust, and the share of points that agree with it."""
+    rays = [np.column_stack([p, np.ones(len(p))]) @ np.linalg.inv(K).T for p in (start, now)]
+    a, b = (r / np.linalg.norm(r, axis=1, keepdims=True) for r in rays)
+    weight, off_px = inlier.astype(float), np.zeros(len(start))
+    R = np.eye(3)
+    for _ in range(8):
+        U, _, Vt = np.linalg.svd((b * weight[:, None]).T @ a)
+        R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+        off_px = np.linalg.norm(_moved(K @ R @ np.linalg.inv(K), start) - now, axis=1)
+        weight = 1.0 / (1.0 + (off_px / INLIER_PX) ** 2) ** 2
+    return R, float(np.mean(off_px < INLIER_PX))
