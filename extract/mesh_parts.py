@@ -30,6 +30,8 @@ PART_M, HANDLE_REACH_M, BAIL_M = 0.022, 0.014, 0.04
 # wall deeper down does not. All of it lies within the larger angle.
 LIP_M, LIP_SHARE, LIP_HALF_RAD, LIP_ANGLE_RAD = 0.002, 0.03, math.radians(28), math.radians(70)
 LIP_DEPTH, LIP_LEFT = 0.3, 0.2
+# A hole in the lid over a beak is at least so large.
+BEAK_M2 = 8e-6
 # Holes and pits belong to the part in about the same direction; one can look so far into the end of an open tube.
 SAME_WAY_RAD, OPEN_M, MAX_LOOK_M = 0.35, 0.005, 0.04
 # What the fingers of a parallel hand span; a stretch of wall that is narrower can be held.
@@ -161,7 +163,7 @@ def _spread_rad(xy: Array) -> float:
 def _is_outlet_pit(center_xy: Array, area_m2: float, hollow: Hollow) -> bool:
     """Whether a pit is a mouth out on one side, as a spout's or a beak's is."""
     away = float(np.linalg.norm(center_xy - hollow.axis_xy_m))
-    return away > 0.5 * float(np.median(hollow.inner_m)) and area_m2 > 2e-5
+    return away > 0.5 * float(np.median(hollow.inner_m)) and area_m2 > BEAK_M2
 
 
 def _is_handle(part: Part) -> bool:

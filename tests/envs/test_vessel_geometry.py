@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import trimesh
 from scipy.spatial.transform import Rotation
 from vid2demo.envs.scene import build_scene
 from vid2demo.envs.vessel_geometry import (
@@ -11,8 +12,9 @@ from vid2demo.envs.vessel_geometry import (
     gripper_half_width_m,
     visual_parts,
 )
-from vid2demo.extract.geometry import make_pose
-from vid2demo.extract.vessels import CATEGORIES, make_vessel
+from vid2demo.extract.geometry import Array, make_pose
+from vid2demo.extract.vessel_from_mesh import measured
+from vid2demo.extract.vessels import CATEGORIES, Vessel, make_vessel
 
 
 @pytest.fixture
@@ -59,9 +61,33 @@ def test_hollow_holds_what_the_vessel_holds(category: str) -> None:
     assert cavity_of(vessel).volume_m3 == pytest.approx(vessel.interior_volume_m3, rel=0.05)
 
 
-@pytest.mark.parametrize("category", CATEGORIES)
+@pytest.mark.parametrize("category", ["bowl", "carton", "teapot", "pitcher", "bottle"])
+def test_the_hollow_measured_in_a_mesh_is_the_librarys(category: str) -> None:
+    known = make_vessel(category)
+    vessel, _, _ = measured(known.mesh, category)
+    cavity = cavity_of(vessel)
+    assert cavity.volume_m3 == pytest.approx(known.interior_volume_m3, rel=0.03)
+    points = cavity_of(known).sample(2000)
+    assert np.mean(cavity.contains(points)) > 0.96
+
+
+def slanted_trough() -> Vessel:
+    """A vessel from a mesh, of a section that is neither round nor alike in any direction: a leaning triangle."""
+    corners = np.array([[0.07, 0.0], [-0.02, 0.05], [-0.03, -0.04]])
+    outer, inner = (prism(corners * scale, low, 0.09) for scale, low in ((1.0, 0.0), (0.88, 0.006)))
+    trough = trimesh.boolean.difference([outer, inner.apply_translation((0, 0, 0.001))], engine="manifold")
+    return measured(trough, "trough", up="+z")[0]
+
+
+def prism(corners_m: Array, low_m: float, high_m: float) -> trimesh.Trimesh:
+    """The hull of a polygon (n, 2) at one height and, half as large again, at another."""
+    rings = [np.column_stack([corners_m * f, np.full(len(corners_m), z)]) for f, z in ((1.0, low_m), (1.5, high_m))]
+    return trimesh.Trimesh(np.vstack(rings)).convex_hull
+
+
+@pytest.mark.parametrize("category", [*CATEGORIES, "trough"])
 def test_walls_leave_the_hollow_free_and_close_it_all_round(category: str) -> None:
-    vessel = make_vessel(category)
+    vessel = slanted_trough() if category == "trough" else make_vessel(category)
     cavity = cavity_of(vessel)
     boxes = collision_boxes(vessel, cavity)
     low = np.array([*(cavity.axis_xy_m - 1.2 * cavity.reach_m), cavity.z_m[0] - 0.01])
@@ -95,6 +121,19 @@ def test_visual_parts_keep_colours_and_stay_light() -> None:
     vertices = np.vstack([vertices for _, vertices, _ in parts])
     np.testing.assert_allclose(vertices.min(0), mesh.bounds[0], atol=0.003)
     np.testing.assert_allclose(vertices.max(0), mesh.bounds[1], atol=0.003)
+
+
+def test_a_textured_mesh_is_thinned_as_a_whole_so_that_it_does_not_tear() -> None:
+    mesh = make_vessel("mug").mesh
+    shades = np.random.default_rng(0).integers(4, size=len(mesh.faces))
+    palette = np.array([[200, 30, 30, 255], [30, 200, 30, 255], [30, 30, 200, 255], [90, 90, 90, 255]], np.uint8)
+    mesh.visual.face_colors = palette[shades]
+    parts = visual_parts(mesh, max_faces=1500)
+    assert len(parts) == 4
+    assert sum(len(faces) for _, _, faces in parts) <= 1500
+    together = trimesh.util.concatenate([trimesh.Trimesh(v, f, process=False) for _, v, f in parts])
+    together.merge_vertices()
+    assert together.is_watertight
 
 
 def test_fingers_close_on_the_handle(mug_pour) -> None:
