@@ -15,17 +15,17 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..extract.errors import UserError
 from ..extract.geometry import Array
 from . import fast_liquid_kernels as kernels
+from .fast_liquid_walls import walls_of
 from .liquid import Liquid
 from .vessel_geometry import Box
 
-SUBSTEPS = 4
-# How far a particle may move against a vessel in a step and still find its walls in the grid, and the grid's cells.
-REACH_M, CELL_M = 0.003, 0.004
+# Substeps of a step: the deeper the pile, the more sweeps carry its weight. With fewer, the lowest of 500 particles in
+# a beaker are squeezed into each other.
+MIN_SUBSTEPS, PARTICLES_PER_SUBSTEP = 4, 50
 # The vessel feels the particles' push through a filter of this time constant: a step's blows are not smooth.
 FILTER_S = 0.01
 
@@ -56,16 +56,16 @@ class FastLiquid:
         self.wrench: Array = np.zeros(6)
         mass_kg = liquid.particle_mass_kg(radius_m)
         taken = -math.expm1(-timestep_s / FILTER_S)
-        self._numbers = (radius_m, timestep_s, mass_kg, liquid.friction, liquid.drag_1_s, taken, SUBSTEPS)
-        groups = [vessel_boxes, receptacle_boxes, static_shapes]
-        self._walls = _walls(groups, radius_m + REACH_M)
-        self._poses: Array = np.tile(np.eye(4), (len(groups), 2, 1, 1))
+        substeps = max(MIN_SUBSTEPS, 2 + count // PARTICLES_PER_SUBSTEP)
+        self._numbers = (radius_m, timestep_s, mass_kg, liquid.friction, liquid.drag_1_s, taken, substeps)
+        self._walls = walls_of([vessel_boxes, receptacle_boxes, static_shapes], radius_m)
+        self._poses: Array = np.tile(np.eye(4), (3, 2, 1, 1))
         buckets = 1 << max(6, (2 * count - 1).bit_length())
-        self._room = (*(np.zeros((count, 3)) for _ in range(3)), np.zeros(count, np.int32))
+        self._room = (np.zeros((count, 3)), np.zeros((count, 3)), np.zeros((count, 3)), np.zeros(count, np.int32))
         self._pairs = np.zeros((kernels.MAX_PAIRS * count, 2), np.int32)
         self._grid = (np.zeros((count, 4), np.int32), np.zeros(buckets + 1, np.int32), np.zeros(count, np.int32))
-        self._which = np.zeros((kernels.MAX_CONTACTS * count, 2), np.int32)
-        self._contacts: Array = np.zeros((kernels.MAX_CONTACTS * count, kernels.CONTACT_WIDTH))
+        most = kernels.MAX_CONTACTS * count
+        self._contacts = (np.zeros((most, 2), np.int32), np.zeros((most, kernels.CONTACT_WIDTH)))
 
     def place(self, positions_m: Array) -> None:
         """Put the particles at (N, 3) in the world, at rest."""
@@ -82,10 +82,9 @@ class FastLiquid:
             self.velocities_m_s,
             self._room,
             poses,
-            *self._walls,
+            self._walls,
             self._pairs,
             self._grid,
-            self._which,
             self._contacts,
             self.wrench,
             self._numbers,
@@ -112,36 +111,3 @@ class FastLiquid:
         self.positions_m[:] = state[:size].reshape(-1, 3)
         self.velocities_m_s[:] = state[size : 2 * size].reshape(-1, 3)
         self.wrench[:] = state[2 * size :]
-
-
-def _walls(
-    groups: list[list[Box]], reach_m: float
-) -> tuple[Array, NDArray[np.int32], Array, NDArray[np.int32], NDArray[np.int32]]:
-    """The shapes of all groups as the kernels take them, and the grids in which they are looked up.
-
-    Shapes (B, 16); for each group (G, 6) its first shape, the one after its last, where its cells begin in `starts`
-    and how many cells it has along each axis; for each group (G, 5) its grid's corner, cell size and reach, all in m;
-    `starts` into `items`, the numbers of the shapes near a cell. What stands still, the last group, is few and wide:
-    it has no grid, its reach is 0.
-    """
-    shapes = np.array(
-        [[*box.center_m, *box.R.ravel(), *box.half_m, float(box.round)] for boxes in groups for box in boxes]
-    )
-    ends = np.cumsum([len(boxes) for boxes in groups])
-    ranges, grids = np.zeros((len(groups), 6), np.int32), np.zeros((len(groups), 5))
-    starts, items = [np.zeros(0, np.int32)], [np.zeros(0, np.int32)]
-    for g, boxes in enumerate(groups):
-        first = ends[g] - len(boxes)
-        ranges[g, :2] = first, ends[g]
-        if g == len(groups) - 1:
-            continue
-        spans = np.array([np.linalg.norm(box.half_m) for box in boxes])[:, None] + reach_m
-        centers = np.array([box.center_m for box in boxes])
-        low, high = (centers - spans).min(axis=0), (centers + spans).max(axis=0)
-        size = np.ceil((high - low) / CELL_M).astype(np.int32)
-        begin, found = kernels.shapes_by_cell(shapes[first : ends[g]], low, CELL_M, size, reach_m)
-        ranges[g, 2], ranges[g, 3:] = sum(map(len, starts)), size
-        grids[g] = [*low, CELL_M, REACH_M]
-        starts.append(begin + sum(map(len, items)))
-        items.append(found + first)
-    return shapes, ranges, grids, *(np.concatenate(parts).astype(np.int32) for parts in (starts, items))

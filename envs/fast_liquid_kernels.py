@@ -8,7 +8,6 @@ and nothing is summed in parallel, so equal input gives equal bits.
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 from numba import njit
@@ -17,6 +16,10 @@ from numpy.typing import NDArray
 from ..extract.geometry import Array
 
 Ints = NDArray[np.int32]
+# Shapes, groups, grids, starts, items, as `fast_liquid` makes them; whom and what a contact touches, and its plane.
+Walls = tuple[Array, Ints, Array, Ints, Ints]
+Contacts = tuple[Ints, Array]
+compiled = njit(cache=True, error_model="numpy")
 
 GRAVITY_M_S2 = 9.81
 # Pairs that will be nearer than so many radii in the middle of a step are watched through it: faster ones are noticed
@@ -34,7 +37,7 @@ MAX_PAIRS, MAX_CONTACTS = 24, 12  # each particle
 CONTACT_WIDTH = 11
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled
 def nearest(shapes: Array, k: int, x: float, y: float, z: float) -> tuple[float, float, float, float]:
     """Signed distance of a point from shape `k`'s surface and the unit vector (3 numbers) that leads away from it."""
     dx, dy, dz = x - shapes[k, 0], y - shapes[k, 1], z - shapes[k, 2]
@@ -74,7 +77,7 @@ def nearest(shapes: Array, k: int, x: float, y: float, z: float) -> tuple[float,
     )
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled
 def within(shapes: Array, k: int, x: float, y: float, z: float, reach_m: float) -> bool:
     """Whether a point may lie within `reach_m` of shape `k`: cheaper than `nearest`, generous at edges and corners."""
     dx, dy, dz = x - shapes[k, 0], y - shapes[k, 1], z - shapes[k, 2]
@@ -83,48 +86,10 @@ def within(shapes: Array, k: int, x: float, y: float, z: float, reach_m: float) 
     if abs(shapes[k, 3] * dx + shapes[k, 6] * dy + shapes[k, 9] * dz) > shapes[k, 12] + reach_m:
         return False
     second = shapes[k, 12] if shapes[k, 15] > 0.0 else shapes[k, 13]
-    return abs(shapes[k, 4] * dx + shapes[k, 7] * dy + shapes[k, 10] * dz) <= second + reach_m
+    return bool(abs(shapes[k, 4] * dx + shapes[k, 7] * dy + shapes[k, 10] * dz) <= second + reach_m)
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def shapes_by_cell(shapes: Array, low: Array, cell_m: float, size: Ints, reach_m: float) -> tuple[Ints, Ints]:
-    """For each cell of a grid the shapes that come within `reach_m` of it: starts (cells + 1,) into items."""
-    starts = np.zeros(size[0] * size[1] * size[2] + 1, np.int32)
-    items = np.zeros(0, np.int32)
-    far = reach_m + 0.5 * math.sqrt(3.0) * cell_m
-    for filling in (False, True):
-        if filling:
-            for cell in range(len(starts) - 1):
-                starts[cell + 1] += starts[cell]
-            items = np.zeros(starts[-1], np.int32)
-            taken = starts.copy()
-        for number in range(len(shapes)):
-            first, last = np.zeros(3, np.int32), np.zeros(3, np.int32)
-            for axis in range(3):
-                row = shapes[number, 3 + 3 * axis : 6 + 3 * axis]
-                # A cylinder's second half extent is unused; its first bounds it along both.
-                second = shapes[number, 12] if shapes[number, 15] > 0.0 else shapes[number, 13]
-                half = (
-                    abs(row[0]) * shapes[number, 12] + abs(row[1]) * second + abs(row[2]) * shapes[number, 14] + reach_m
-                )
-                first[axis] = max(0, math.floor((shapes[number, axis] - half - low[axis]) / cell_m))
-                last[axis] = min(size[axis] - 1, math.floor((shapes[number, axis] + half - low[axis]) / cell_m))
-            for i in range(first[0], last[0] + 1):
-                for j in range(first[1], last[1] + 1):
-                    for k in range(first[2], last[2] + 1):
-                        x, y, z = low[0] + (i + 0.5) * cell_m, low[1] + (j + 0.5) * cell_m, low[2] + (k + 0.5) * cell_m
-                        if nearest(shapes, number, x, y, z)[0] > far:
-                            continue
-                        cell = (i * size[1] + j) * size[2] + k
-                        if filling:
-                            items[taken[cell]] = number
-                            taken[cell] += 1
-                        else:
-                            starts[cell + 1] += 1
-    return starts, items
-
-
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled
 def find_pairs(x: Array, radius_m: float, pairs: Ints, cells: Ints, starts: Ints, order: Ints) -> int:
     """Fill `pairs` (M, 2) with all particles near each other, by a hashed grid (Teschner et al. 2003); their number.
 
@@ -165,36 +130,32 @@ def find_pairs(x: Array, radius_m: float, pairs: Ints, cells: Ints, starts: Ints
     return found
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled
 def _bucket(a: int, b: int, c: int, mask: int) -> int:
     return ((a * 73856093) ^ (b * 19349663) ^ (c * 83492791)) & mask
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled
 def find_contacts(
     first: Array,
     goal: Array,
     chosen: Ints,
     chosen_count: int,
     radius_m: float,
-    shapes: Array,
-    groups: Ints,
-    lows: Array,
-    starts: Ints,
-    items: Ints,
+    walls: Walls,
     poses: Array,
-    which: Ints,
-    contacts: Array,
+    out: Contacts,
 ) -> int:
     """Planes that hold the chosen particles back from the walls on their ways from `first` to `goal`; their number.
 
     Each way is followed in the frame of each group, where the walls stand still, up to the first shape that it runs
     into (conservative advancement), so nothing is jumped over. Every shape that the rest of the way might reach from
-    there gives a contact: the plane through its nearest point. Rows of `contacts`: the plane's normal and offset before
-    the step and their change, and the way of its foot, in the world.
+    there gives a contact: the plane through its nearest point. A row of it: the plane's normal and offset before the
+    step and their change, and the way of its foot, in the world.
     """
-    found = 0
-    room = len(which)
+    shapes, groups, lows, starts, items = walls
+    which, contacts = out
+    found, room = 0, len(which)
     slack, arrived = SLACK_RADII * radius_m, ARRIVED_RADII * radius_m
     for g in range(len(groups)):
         before, after = poses[g, 0], poses[g, 1]
@@ -258,7 +219,7 @@ def find_contacts(
     return found
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled
 def _inside(T: Array, x: float, y: float, z: float) -> tuple[float, float, float]:
     x, y, z = x - T[0, 3], y - T[1, 3], z - T[2, 3]
     return (
@@ -268,7 +229,7 @@ def _inside(T: Array, x: float, y: float, z: float) -> tuple[float, float, float
     )
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled
 def _turned(T: Array, x: float, y: float, z: float) -> tuple[float, float, float]:
     return (
         T[0, 0] * x + T[0, 1] * y + T[0, 2] * z,
@@ -277,13 +238,13 @@ def _turned(T: Array, x: float, y: float, z: float) -> tuple[float, float, float
     )
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled
 def _outside(T: Array, x: float, y: float, z: float) -> tuple[float, float, float]:
     x, y, z = _turned(T, x, y, z)
     return x + T[0, 3], y + T[1, 3], z + T[2, 3]
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled
 def project_pairs(x: Array, last: Array, pairs: Ints, count: int, radius_m: float, friction: float, h: float) -> None:
     """Push overlapping particles apart, half each (PBD, Müller et al. 2007, eq. 10)."""
     touch = 2.0 * radius_m
@@ -314,7 +275,7 @@ def project_pairs(x: Array, last: Array, pairs: Ints, count: int, radius_m: floa
         x[j, 2] -= mz
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled
 def _friction(
     dx: float, dy: float, dz: float, nx: float, ny: float, nz: float, most: float
 ) -> tuple[float, float, float]:
@@ -326,12 +287,11 @@ def _friction(
     return -part * dx, -part * dy, -part * dz
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled
 def project_contacts(
     x: Array,
     last: Array,
-    which: Ints,
-    contacts: Array,
+    out: Contacts,
     count: int,
     share: float,
     step: float,
@@ -344,6 +304,7 @@ def project_contacts(
 
     Adds what group 0 gave them to `moved` (6,): the sum of their ways and of its moment about `origin`.
     """
+    which, contacts = out
     for k in range(count):
         i, c = which[k, 0], contacts[k]
         nx, ny, nz = c[0] + share * c[4], c[1] + share * c[5], c[2] + share * c[6]
@@ -375,19 +336,12 @@ def project_contacts(
             _felt(x, i, origin, mx, my, mz, moved)
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled
 def catch(
-    x: Array,
-    v: Array,
-    which: Ints,
-    contacts: Array,
-    count: int,
-    timestep_s: float,
-    h: float,
-    origin: Array,
-    moved: Array,
+    x: Array, v: Array, out: Contacts, count: int, timestep_s: float, h: float, origin: Array, moved: Array
 ) -> None:
     """At the end of a step, put particles back in front of walls and take from them the speed into the wall."""
+    which, contacts = out
     for _ in range(2):
         for k in range(count):
             i, c = which[k, 0], contacts[k]
@@ -408,7 +362,7 @@ def catch(
                 _felt(x, i, origin, h * into * nx, h * into * ny, h * into * nz, moved)
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled
 def _felt(x: Array, i: int, origin: Array, mx: float, my: float, mz: float, moved: Array) -> None:
     """Add a way (3 numbers) that a wall gave particle i, and its moment about `origin`, to `moved` (6,)."""
     ax, ay, az = x[i, 0] - origin[0], x[i, 1] - origin[1], x[i, 2] - origin[2]
@@ -420,21 +374,16 @@ def _felt(x: Array, i: int, origin: Array, mx: float, my: float, mz: float, move
     moved[5] += ax * my - ay * mx
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled
 def advance(
     x: Array,
     v: Array,
-    room: tuple[Any, Any, Any, Any],
+    room: tuple[Array, Array, Array, Ints],
     poses: Array,
-    shapes: Array,
-    groups: Ints,
-    lows: Array,
-    starts: Ints,
-    items: Ints,
+    walls: Walls,
     pairs: Ints,
-    grid: tuple[Any, Any, Any],
-    which: Ints,
-    contacts: Array,
+    grid: tuple[Ints, Ints, Ints],
+    out: Contacts,
     wrench: Array,
     numbers: tuple[float, float, float, float, float, float, int],
 ) -> None:
@@ -453,9 +402,7 @@ def advance(
             goal[i, axis] = x[i, axis] + timestep_s * v[i, axis]
         goal[i, 2] -= fall
     pair_count = find_pairs(last, radius_m, pairs, grid[0], grid[1], grid[2])
-    count = find_contacts(
-        first, goal, chosen, len(x), radius_m, shapes, groups, lows, starts, items, poses, which, contacts
-    )
+    count = find_contacts(first, goal, chosen, len(x), radius_m, walls, poses, out)
     h = timestep_s / substeps
     kept = 1.0 / (1.0 + drag_1_s * h)
     moved = np.zeros(6)
@@ -472,7 +419,7 @@ def advance(
             x_row[a] += h * v_row[a]
         project_pairs(x, last, pairs, pair_count, radius_m, friction, h)
         share, part = (s + 1) / substeps, 1 / substeps
-        project_contacts(x, last, which, contacts, count, share, part, friction, h, origin, moved)
+        project_contacts(x, last, out, count, share, part, friction, h, origin, moved)
         for a in range(len(x_row)):
             v_row[a] = rate_hz * (x_row[a] - last_row[a])
     # Who was knocked off the foreseen way may have met walls that nobody looked for.
@@ -483,10 +430,8 @@ def advance(
         if dx * dx + dy * dy + dz * dz > far * far:
             chosen[strayed] = i
             strayed += 1
-    count = find_contacts(
-        first, x, chosen, strayed, radius_m, shapes, groups, lows, starts, items, poses, which, contacts
-    )
-    catch(x, v, which, contacts, count, timestep_s, h, origin, moved)
+    count = find_contacts(first, x, chosen, strayed, radius_m, walls, poses, out)
+    catch(x, v, out, count, timestep_s, h, origin, moved)
     for axis in range(6):
         push = -mass_kg / h / timestep_s * moved[axis]
         wrench[axis] += taken * (push - wrench[axis])

@@ -12,7 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from vid2demo.envs import fast_liquid_kernels as kernels
-from vid2demo.envs.fast_liquid import REACH_M, FastLiquid, _walls
+from vid2demo.envs.fast_liquid import FastLiquid
+from vid2demo.envs.fast_liquid_walls import REACH_M, walls_of
 from vid2demo.envs.kinematics import arm_seeds, panda_chain, solve_ik
 from vid2demo.envs.liquid import GRAVITY_M_S2, Liquid, fill_positions
 from vid2demo.envs.panda import DQ_MAX_RAD_S
@@ -176,7 +177,7 @@ class TestSearch:
         half = rng.uniform(0.005, 0.05, 3)
         half[1] = half[0] if is_round else half[1]
         box = Box(rng.normal(0, 0.02, 3), Rotation.random(rng=rng).as_matrix(), half, is_round)
-        shapes = _walls([[box], [box], [box]], 0.01)[0]
+        shapes = walls_of([[box], [box], [box]], RADIUS_M)[0]
         point = rng.normal(0, 0.05, 3)
         distance, *normal = kernels.nearest(shapes, 0, *point)
         assert np.linalg.norm(normal) == pytest.approx(1.0)
@@ -189,7 +190,7 @@ class TestSearch:
         cavity = cavity_of(vessel)
         boxes = collision_boxes(vessel, cavity)
         reach_m = RADIUS_M + REACH_M
-        _, ranges, grids, starts, items = _walls([boxes, boxes, []], reach_m)
+        _, ranges, grids, starts, items = walls_of([boxes, boxes, []], RADIUS_M)
         points = np.random.default_rng(0).uniform(-0.08, 0.08, (3000, 3))
         near = np.array([box.distance_m(points) for box in boxes]) < reach_m
         for point, reached in zip(points, near.T, strict=True):
