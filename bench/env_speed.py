@@ -52,6 +52,8 @@ def main() -> None:
     q_rad = arm_trajectory(reference).astype(np.float32)
     rows = []
     for count in PARTICLES:
+        # The first one of all loads the compiled arithmetic.
+        PandaPourEnv(reference, num_particles=count).step(q_rad[0])
         start = time.process_time()
         env = PandaPourEnv(reference, num_particles=count)
         make_s = time.process_time() - start
