@@ -6,7 +6,7 @@ chosen here: the camera's tilt, scale, place and yaw in the workspace, grasp, st
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -74,6 +74,8 @@ def build_reference(
         raise UserError(f"the camera's elevation is {elevation_deg} degrees; give one from -90 to 90")
     held = vessel or vessel_from_header(track.header.get("mesh", {}), "held vessel")
     target = receptacle or _receptacle_of(receptacle_track)
+    track = _in_vessel_frame(track, held)
+    receptacle_track = receptacle_track and _in_vessel_frame(receptacle_track, target)
     resampled = resample_track(track, control_hz)
     notes = list(resampled.notes)
     seen = _upright(track, resampled, receptacle_track, held, elevation_deg, gravity_tolerance_deg, notes)
@@ -150,6 +152,14 @@ def _receptacle_of(track: ObjectTrack | None) -> Vessel:
     if track is not None and ("library" in track.header.get("mesh", {}) or "file" in track.header.get("mesh", {})):
         return vessel_from_header(track.header["mesh"], "receptacle")
     return make_vessel(DEFAULT_RECEPTACLE)
+
+
+def _in_vessel_frame(track: ObjectTrack, vessel: Vessel) -> ObjectTrack:
+    """A track of the vessel's own frame: a user's mesh was followed in the axes of its file."""
+    source = vessel.source
+    if source is None or track.header.get("mesh", {}).get("sha256") != source.sha256:
+        return track
+    return replace(track, T_camera_object=track.T_camera_object @ source.T_file_vessel)
 
 
 def _upright(

@@ -6,14 +6,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from vid2demo.envs.builtin import arm_trajectory, builtin_reference, emptying_tilt_deg, pour_reference
 from vid2demo.envs.collision import CollisionChecker
 from vid2demo.envs.kinematics import limit_margin_rad, panda_chain
 from vid2demo.envs.panda import DQ_MAX_RAD_S
+from vid2demo.envs.placement import build_reference
 from vid2demo.envs.pouring import PandaPourEnv
-from vid2demo.envs.reference import Reference
+from vid2demo.envs.reference import Reference, minimum_jerk
 from vid2demo.envs.vessel_geometry import gripper_half_width_m
 from vid2demo.extract.errors import UserError
+from vid2demo.extract.geometry import focal_prior_camera_matrix, invert_pose, look_at, make_pose
+from vid2demo.extract.meshes import load_mesh, mesh_sha256
+from vid2demo.extract.track import ObjectTrack
 from vid2demo.extract.vessel_from_mesh import vessel_from_mesh
 from vid2demo.extract.vessels import CATEGORIES, Vessel, make_vessel
 
@@ -87,6 +92,35 @@ def test_a_vessel_from_a_file_is_held_and_poured(tmp_path: Path) -> None:
     info = poured(reference, particles=60)
     assert info["poured_fraction"] >= 0.97
     assert info["spilled_fraction"] <= 0.02
+
+
+def test_a_track_in_the_axes_of_a_users_file_becomes_a_motion_of_the_vessel(tmp_path: Path) -> None:
+    """The file has y up and its handle elsewhere; what is tracked is the file's frame, what is poured the vessel."""
+    R_file_vessel = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
+    T_file_vessel = make_pose(R_file_vessel, (0.02, -0.01, 0.03))
+    mesh = make_vessel("mug").mesh.copy()
+    mesh.apply_transform(T_file_vessel)
+    mesh.export(tmp_path / "mug.ply")
+    time_s = np.arange(100) / 25
+    tilt_rad = np.deg2rad(60) * minimum_jerk((time_s - 1.0) / 2.0)
+    T_table_vessel = np.tile(np.eye(4), (100, 1, 1))
+    T_table_vessel[:, :3, :3] = Rotation.from_rotvec(np.outer(tilt_rad, [0.0, 1.0, 0.0])).as_matrix()
+    T_table_vessel[:, 0, 3] = 0.2 * minimum_jerk(time_s / 2.0)
+    T_table_vessel[:, 2, 3] = 0.045 + 0.2 * minimum_jerk(time_s / 2.0)
+    camera = look_at(np.array([0.1, -0.75, 0.42]), np.array([0.1, 0.0, 0.15]), np.array([0.0, 0.0, 1.0]))
+    entry = {"file": str(tmp_path / "mug.ply"), "unit": "auto", "sha256": mesh_sha256(load_mesh(tmp_path / "mug.ply"))}
+    T_camera_file = invert_pose(camera) @ T_table_vessel @ invert_pose(T_file_vessel)
+    K = focal_prior_camera_matrix(640, 480)
+    track = ObjectTrack(T_camera_file, time_s, K, np.ones(100), np.ones(100, bool), {"object": "mug", "mesh": entry})
+    reference = build_reference(track, elevation_deg=20.0)
+    held = reference.vessel()
+    assert held.source is not None
+    assert (held.category, held.source.up) == ("mug", "+y")
+    assert reference.tilt_rad[0] == pytest.approx(0.0, abs=0.01)
+    assert np.rad2deg(reference.tilt_rad.max()) == pytest.approx(60.0, abs=1.0)
+    assert reference.T_world_object[0, 2, 3] == pytest.approx(0.045, abs=0.005)
+    moved = invert_pose(reference.T_world_object[0]) @ reference.T_world_object[-1]
+    np.testing.assert_allclose(moved, invert_pose(T_table_vessel[0]) @ T_table_vessel[-1], atol=0.004)
 
 
 @pytest.mark.slow
