@@ -25,7 +25,7 @@ from .vessel_geometry import Box
 
 # Substeps of a step: the deeper the pile, the more sweeps carry its weight. With fewer, the lowest of 500 particles in
 # a beaker are squeezed into each other.
-MIN_SUBSTEPS, PARTICLES_PER_SUBSTEP = 4, 50
+MIN_SUBSTEPS, PARTICLES_PER_SUBSTEP = 3, 50
 # The vessel feels the particles' push through a filter of this time constant: a step's blows are not smooth.
 FILTER_S = 0.01
 
@@ -56,7 +56,7 @@ class FastLiquid:
         self.wrench: Array = np.zeros(6)
         mass_kg = liquid.particle_mass_kg(radius_m)
         taken = -math.expm1(-timestep_s / FILTER_S)
-        substeps = max(MIN_SUBSTEPS, 2 + count // PARTICLES_PER_SUBSTEP)
+        substeps = max(MIN_SUBSTEPS, 1 + count // PARTICLES_PER_SUBSTEP)
         self._numbers = (radius_m, timestep_s, mass_kg, liquid.friction, liquid.drag_1_s, taken, substeps)
         self._walls = walls_of([vessel_boxes, receptacle_boxes, static_shapes], radius_m)
         self._poses: Array = np.tile(np.eye(4), (3, 2, 1, 1))
