@@ -13,6 +13,7 @@ that they belong to, where they do not move.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -35,6 +36,7 @@ class FastLiquid:
 
     positions_m, velocities_m_s: (N, 3) in the world, may be written to between steps. wrench: (6,) what the particles
     put on the held vessel, filtered: force in N, torque about its origin in N m, world axes.
+    poses: (3, 2, 4, 4) of vessel, receptacle and surrounding, before and after a step. arguments: of `kernels.advance`.
     """
 
     def __init__(
@@ -59,13 +61,25 @@ class FastLiquid:
         substeps = max(MIN_SUBSTEPS, 1 + count // PARTICLES_PER_SUBSTEP)
         self._numbers = (radius_m, timestep_s, mass_kg, liquid.friction, liquid.drag_1_s, taken, substeps)
         self._walls = walls_of([vessel_boxes, receptacle_boxes, static_shapes], radius_m)
-        self._poses: Array = np.tile(np.eye(4), (3, 2, 1, 1))
+        self.poses: Array = np.tile(np.eye(4), (3, 2, 1, 1))
         buckets = 1 << max(6, (2 * count - 1).bit_length())
         self._room = (np.zeros((count, 3)), np.zeros((count, 3)), np.zeros((count, 3)), np.zeros(count, np.int32))
         self._pairs = np.zeros((kernels.MAX_PAIRS * count, 2), np.int32)
         self._grid = (np.zeros((count, 4), np.int32), np.zeros(buckets + 1, np.int32), np.zeros(count, np.int32))
         most = kernels.MAX_CONTACTS * count
         self._contacts = (np.zeros((most, 2), np.int32), np.zeros((most, kernels.CONTACT_WIDTH)))
+        self.arguments: Any = (
+            self.positions_m,
+            self.velocities_m_s,
+            self._room,
+            self.poses,
+            self._walls,
+            self._pairs,
+            self._grid,
+            self._contacts,
+            self.wrench,
+            self._numbers,
+        )
 
     def place(self, positions_m: Array) -> None:
         """Put the particles at (N, 3) in the world, at rest."""
@@ -75,20 +89,9 @@ class FastLiquid:
 
     def step(self, T_world_vessel_before: Array, T_world_vessel_after: Array, T_world_receptacle: Array) -> Array:
         """Advance by one step in which the vessel goes from one pose (4, 4) to the other; `wrench`."""
-        poses = self._poses
+        poses = self.poses
         poses[0, 0], poses[0, 1], poses[1] = T_world_vessel_before, T_world_vessel_after, T_world_receptacle
-        kernels.advance(
-            self.positions_m,
-            self.velocities_m_s,
-            self._room,
-            poses,
-            self._walls,
-            self._pairs,
-            self._grid,
-            self._contacts,
-            self.wrench,
-            self._numbers,
-        )
+        kernels.advance(*self.arguments)
         return self.wrench
 
     def settle(self, T_world_vessel: Array, T_world_receptacle: Array, duration_s: float) -> None:

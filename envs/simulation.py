@@ -29,6 +29,7 @@ from .scene import RECEPTACLE_BODY, VESSEL_BODY, Scene, build_scene, particle_ob
 
 if TYPE_CHECKING:
     from .fast_liquid import FastLiquid
+    from .fast_steps import Together
 
 # The spout's conduit looks at the particles every so many physics steps.
 CONDUIT_STRIDE = 2
@@ -117,22 +118,22 @@ class Simulation:
 
     def advance(self, commands: Array) -> None:
         """One physics step for each of the commands (K, 7) to the arm."""
-        data, model, control, step, conduit = self.data, self.model, self.data.ctrl, mujoco.mj_step, self._conduit
-        if self._fast is not None:
-            self._advance_fast(commands, self._fast)
-            return
+        conduit = self._conduit
         if conduit is None:
-            self._advance_engine(commands)
+            self._step(commands)
             return
-        for i, command in enumerate(commands):
-            control[:ARM] = command
-            step(model, data)
-            if i % CONDUIT_STRIDE == 0 and conduit.may_flow(self.T_world_vessel, self.particles_m):
+        for start in range(1 - CONDUIT_STRIDE, len(commands), CONDUIT_STRIDE):
+            end = start + CONDUIT_STRIDE
+            self._step(commands[max(start, 0) : end])
+            if end <= len(commands) and conduit.may_flow(self.T_world_vessel, self.particles_m):
                 self._read_twist()
                 conduit.move(self.particles_m, self.particle_velocities_m_s, self.T_world_vessel, self.twist)
 
-    def _advance_engine(self, commands: Array) -> None:
+    def _step(self, commands: Array) -> None:
         """All steps in one call, during which other threads have Python for themselves."""
+        if self._together is not None:
+            self._together.advance(commands, self.T_world_receptacle)
+            return
         data, start_s = self.data, self.data.time
         controls = np.empty((1, len(commands), self.model.nu))
         controls[0, :, :ARM], controls[0, :, ARM:] = commands, data.ctrl[ARM:]
@@ -152,24 +153,6 @@ class Simulation:
         for command in commands[round((data.time - start_s) / self.model.opt.timestep) :]:
             data.ctrl[:ARM] = command
             mujoco.mj_step(self.model, data)
-
-    def _advance_fast(self, commands: Array, liquid: FastLiquid) -> None:
-        data, model, conduit = self.data, self.model, self._conduit
-        push = data.xfrc_applied[self._vessel_id]
-        center_m = data.xipos[self._vessel_id]
-        T_receptacle, T_after = self.T_world_receptacle, self.T_world_vessel
-        for i, command in enumerate(commands):
-            data.ctrl[:ARM] = command
-            mujoco.mj_step(model, data)
-            mujoco.mj_kinematics(model, data)
-            T_before, T_after = T_after, self.T_world_vessel
-            fx, fy, fz, tx, ty, tz = liquid.step(T_before, T_after, T_receptacle).tolist()
-            # The engine takes forces at the centre of mass.
-            x, y, z = (self.vessel_m - center_m).tolist()
-            push[:] = fx, fy, fz, tx + y * fz - z * fy, ty + z * fx - x * fz, tz + x * fy - y * fx
-            if conduit is not None and i % CONDUIT_STRIDE == 0 and conduit.may_flow(T_after, self.particles_m):
-                self._read_twist()
-                conduit.move(self.particles_m, self.particle_velocities_m_s, T_after, self.twist)
 
     def refresh(self) -> None:
         """Bring all that is derived up to the state; after a restored state it is what it was before."""
@@ -274,6 +257,7 @@ class Simulation:
         self.vessel_m, self.vessel_R = data.xpos[self._vessel_id], data.xmat[self._vessel_id].reshape(3, 3)
         self._axes, self._anchors_m, self._rates = data.xaxis[:ARM], data.xanchor[:ARM], data.qvel[:ARM]
         self._fast = self._make_fast() if fast else None
+        self._together = None if self._fast is None else self._put_together(self._fast)
         self.particles_m: Array = data.qpos[self._first_particle :].reshape(-1, 3)
         self.particle_velocities_m_s: Array = data.qvel[self._first_velocity :].reshape(-1, 3)
         if self._fast is not None:
@@ -302,6 +286,11 @@ class Simulation:
             scene.liquid,
             float(self.model.opt.timestep),
         )
+
+    def _put_together(self, liquid: FastLiquid) -> Together:
+        from .fast_steps import Together
+
+        return Together(self.model, self.data, self._vessel_id, liquid)
 
     def _make_conduit(self) -> SpoutConduit:
         scene = self.scene
