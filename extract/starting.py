@@ -12,7 +12,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from .candidates import Model, ObjectRequest, vessel_model
 from .errors import UserError
@@ -27,12 +26,13 @@ from .video import Image
 WORKING_SIDE_PX = 640  # tracking
 STARTING_SIDE_PX = 1280  # the first frame, where thin parts such as spouts must be seen to be fitted
 FOUND_IOU = 0.45  # below this no pose of the mesh explains what was cut out of the first frame
-HYPOTHESES = 4  # first poses, far from each other, that a shape is fitted to
+HYPOTHESES = 3  # first poses, far from each other, that a shape is fitted to
 HYPOTHESES_WITHIN = 0.5  # of the best one's merit
 APART_DEG = 40.0
 RIVAL_WITHIN = 0.2  # of the best one's merit: nearly as good
 FLAT_GREY_LEVELS = 2.0  # standard deviation in the box, below which there is nothing to see
-FIT_ROUNDS = 3  # of cutting the mask near the silhouette and fitting the shape to it
+FIT_ROUNDS = 2  # of cutting the mask near the silhouette and fitting the shape to it, at full sharpness
+COARSE_STEPS_PX = (3.0, 1.5)
 RECUT_BAND = 0.03  # of the object's size in the image
 
 
@@ -124,25 +124,28 @@ def start_object(
             f"object {request.name!r} was not found: the best silhouette covers only {ranked[0][0].iou:.0%} of what "
             "was cut out of the frame"
         )
-    edges = edge_strength(rgb)
-    band_px = max(3, round(RECUT_BAND * max(box[2], box[3])))
-    start_mask = resized(small_mask, rgb) if mask is None else mask
     fits = [
-        _fitted(model, pose, rgb, edges, box, source, camera_matrix, band_px, start_mask)
+        _fitted(model, pose, small, small_mask, small_box, source, small_camera, 1, COARSE_STEPS_PX)
         for pose, model in ranked[:HYPOTHESES]
     ]
     fits.sort(key=lambda fit: fit[1].merit, reverse=True)
     kept = distinct([pose for _, pose, _ in fits], APART_DEG, HYPOTHESES, RIVAL_WITHIN, fits[0][0].symmetry)
-    found = [_hypothesis(*fit, rgb, camera_matrix, band_px) for fit in fits if any(fit[1] is pose for pose in kept)]
+    found = []
+    for model, pose, evidence in fits:
+        if any(pose is k for k in kept):
+            sharp = resized(evidence, rgb) if mask is None else mask
+            # Rivals are only tried for a while: the fine fit is for the best.
+            rounds = 0 if found else FIT_ROUNDS
+            found.append(
+                _hypothesis(*_fitted(model, pose, rgb, sharp, box, source, camera_matrix, rounds), rgb, camera_matrix)
+            )
     return Start(tuple(found), source)
 
 
-def _hypothesis(
-    model: Model, pose: PoseCandidate, evidence: Mask, rgb: Image, camera_matrix: Array, band_px: int
-) -> Hypothesis:
+def _hypothesis(model: Model, pose: PoseCandidate, evidence: Mask, rgb: Image, camera_matrix: Array) -> Hypothesis:
     T = pose.T_camera_object
     silhouette = _silhouette(model.mesh, T, camera_matrix, rgb.shape)
-    mask = _evidence(model.mesh, rgb, T, camera_matrix, evidence, band_px) & silhouette
+    mask = evidence & silhouette
     if model.vessel is not None:
         model = vessel_model(coloured(model.vessel, rgb, mask))
     return Hypothesis(model, pose, mask if mask.any() else silhouette, mask_box(silhouette))
@@ -152,21 +155,22 @@ def _fitted(
     model: Model,
     pose: PoseCandidate,
     rgb: Image,
-    edges: NDArray[np.float32],
+    mask: Mask,
     box: Box,
     source: str,
     camera_matrix: Array,
-    band_px: int,
-    mask: Mask,
+    rounds: int,
+    steps_px: tuple[float, ...] = (3.0, 1.5, 1.0),
 ) -> tuple[Model, PoseCandidate, Mask]:
     """One hypothesis carried on: the vessel's shape and pose fitted to the mask re-cut near its silhouette."""
+    edges, band_px = edge_strength(rgb), max(3, round(RECUT_BAND * max(box[2], box[3])))
     T = pose.T_camera_object
     evidence = _evidence(model.mesh, rgb, T, camera_matrix, mask, band_px)
     pose = judge(model.mesh, T, camera_matrix, edges, evidence, box, model.vessel is not None)
-    for _ in range(FIT_ROUNDS if model.vessel is not None else 0):
+    for _ in range(rounds if model.vessel is not None else 0):
         assert model.vessel is not None
         view = View(*mask_evidence(evidence), T, box if source == "given" else None, edges)
-        vessel, (T_fitted,) = fit_shape(model.vessel, [view], camera_matrix)
+        vessel, (T_fitted,) = fit_shape(model.vessel, [view], camera_matrix, steps_px)
         fitted = vessel_model(vessel)
         before = judge(model.mesh, T, camera_matrix, edges, evidence, box)
         after = judge(fitted.mesh, T_fitted, camera_matrix, edges, evidence, box)
