@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections import deque
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 
 
 def usable_cpus() -> int:
@@ -47,6 +47,22 @@ class Crew:
         if errors:
             raise min(errors, key=lambda found: found[0])[1]
         return done  # type: ignore[return-value]
+
+    def stream[T, U](self, job: Callable[[int], T], then: Callable[[int, T], U], numbers: Sequence[int]) -> list[U]:
+        """then(n, job(n)) for every number, `then` in the caller's thread and in order, beside the jobs to come."""
+        if self._pool is None:
+            return [then(number, job(number)) for number in numbers]
+        jobs = [self._pool.submit(job, number) for number in numbers]
+        try:
+            # A job that nobody has begun is done here.
+            return [
+                then(number, job(number) if waiting.cancel() else waiting.result())
+                for number, waiting in zip(numbers, jobs, strict=True)
+            ]
+        finally:
+            for waiting in jobs:
+                waiting.cancel()
+            wait(jobs)
 
     def close(self) -> None:
         """End the threads."""

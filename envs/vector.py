@@ -126,8 +126,7 @@ class PandaVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
         # Until all have arrived at the end of the step, they are not in step.
         self._is_ready = False
         if self._is_seen:
-            jerks = self._crew.run(lambda i: self._move(i, actions[i]), everyone)
-            turns = [self._turn(i, jerks[i]) for i in everyone]
+            turns = self._crew.stream(lambda i: self._move(i, actions[i]), self._turn, everyone)
         else:
             turns = self._crew.run(lambda i: self._turn(i, self._move(i, actions[i])), everyone)
         self._is_ready = True
