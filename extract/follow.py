@@ -2,19 +2,21 @@
 
 The first pass goes from frame to frame. Then, with glimpses from the whole clip at hand, the spin about the vessel's
 own axis is settled (spin.py) and the vessel's shape is fitted to several frames at once (shape_fit.py). The second
-pass refines every frame from the corrected pose, so that nothing is chained and nothing drifts.
+pass refines every frame from the corrected pose, so that nothing is chained and nothing drifts. A mesh that is known
+exactly needs no second look, except in frames that the first was unsure of: those are tried again from between their
+sure neighbours, with all that the clip has taught by then.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
 
 from .first_pose import edge_score
-from .geometry import Array, invert_pose
+from .geometry import Array, Symmetry, invert_pose
 from .raster import render_depth
 from .region import ColourModel, TrackingMesh, colour_bins, edge_strength
 from .segment import Mask
@@ -51,6 +53,7 @@ class Followed:
     first_mask: Mask
     tracker: ObjectTracker
     guesses: Array | None = None
+    first_look: list[Estimate] | None = None
     estimates: list[Estimate] = field(default_factory=list)
     glimpses: list[Glimpse] = field(default_factory=list)
 
@@ -63,15 +66,25 @@ class Followed:
         mask: Mask,
         T_camera_object: Array,
         guesses: Array | None = None,
+        symmetry: Symmetry | None = None,
     ) -> Followed:
-        """Ready for the first frame, in which the object has the mask and the pose given."""
-        tracker = ObjectTracker(mesh, camera_matrix, rgb, mask, T_camera_object)
+        """Ready for the first frame, in which the object has the mask and the pose given.
+
+        symmetry: of the mesh, where it is not a vessel's.
+        """
+        symmetry = symmetry if vessel is None else vessel.symmetry
+        tracker = ObjectTracker(mesh, camera_matrix, rgb, mask, T_camera_object, symmetry)
         return Followed(mesh, vessel, camera_matrix, mask, tracker, guesses)
 
     def step(self, rgb: Image, index: int, frame_count: int) -> None:
         """Take the next frame."""
+        before = None if self.first_look is None else self.first_look[min(index, len(self.first_look) - 1)]
+        if before is not None and before.confidence >= SURE:
+            self.estimates.append(before)
+            return
         guess = None if self.guesses is None else self.guesses[min(index, len(self.guesses) - 1)]
-        self.estimates.append(self.tracker.step(rgb, guess))
+        now = self.tracker.step(rgb, guess)
+        self.estimates.append(now if before is None or now.confidence > before.confidence else before)
         stride = max(1, frame_count // GLIMPSES)
         if self.guesses is None and self.vessel is not None and index % stride == 0:
             bins, colours = colour_bins(rgb), self.tracker.colours
@@ -90,13 +103,31 @@ class Followed:
         """The same object before the first frame again, with spin and shape settled."""
         poses = np.stack([e.T_camera_object for e in self.estimates])
         mesh, vessel = self.mesh, self.vessel
-        if vessel is not None:
-            poses = self._with_settled_spin(poses, vessel)
-            vessel, shift = self._fitted(poses, vessel)
-            if vessel is not self.vessel:
-                # A handle of the right size shows its side in frames where one of the wrong size did not.
-                mesh, poses = tracking_mesh(vessel), self._with_settled_spin(poses @ shift, vessel, SECOND_LOOK_RAD)
+        if vessel is None:
+            guesses = _between_sure(poses, np.array([e.confidence >= SURE for e in self.estimates]))
+            return Followed(
+                mesh, None, self.camera_matrix, self.first_mask, self.tracker, guesses, first_look=self.estimates
+            )
+        poses = self._with_settled_spin(poses, vessel)
+        vessel, shift = self._fitted(poses, vessel)
+        if vessel is not self.vessel:
+            # A handle of the right size shows its side in frames where one of the wrong size did not.
+            mesh, poses = tracking_mesh(vessel), self._with_settled_spin(poses @ shift, vessel, SECOND_LOOK_RAD)
         return Followed.start(mesh, vessel, self.camera_matrix, first_rgb, self.first_mask, poses[0], poses)
+
+    def again(self, first_rgb: Image, index: int = 0) -> Followed:
+        """The same before frame `index`, whose mask it has: what `second_pass` settled can be followed both ways."""
+        if self.first_look is not None:
+            return replace(self, estimates=[], glimpses=[])
+        assert self.guesses is not None
+        return Followed.start(
+            self.mesh, self.vessel, self.camera_matrix, first_rgb, self.first_mask, self.guesses[index], self.guesses
+        )
+
+    @property
+    def spin_source(self) -> str:
+        """What told the object's turns about its own axis: "texture", "outline" or "none"."""
+        return self.tracker.spin_source(len(self.estimates))
 
     def _with_settled_spin(self, poses: Array, vessel: Vessel, within_rad: float = np.pi) -> Array:
         if vessel.symmetry.order == 0 or len(self.glimpses) < 2:
@@ -145,3 +176,17 @@ class Followed:
                 most = float(np.maximum(glimpse.evidence, 0)[silhouette].sum())
                 total += float(glimpse.evidence[silhouette].sum()) / max(most, 1.0)
         return total / len(glimpses)
+
+
+def _between_sure(poses: Array, sure: NDArray[np.bool_]) -> Array:
+    """The poses (N, 4, 4), those that are not sure replaced by what lies between their sure neighbours."""
+    at = np.flatnonzero(sure)
+    if len(at) < 2:
+        return poses
+    where = np.clip(np.arange(len(poses)), at[0], at[-1])
+    out = poses.copy()
+    out[:, :3, :3] = Slerp(at, Rotation.from_matrix(poses[at, :3, :3]))(where).as_matrix()
+    for axis in range(3):
+        out[:, axis, 3] = np.interp(where, at, poses[at, axis, 3])
+    out[sure] = poses[sure]
+    return out

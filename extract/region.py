@@ -8,7 +8,7 @@ around points of the mesh, so that a mirror-bright or many-coloured object still
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -16,15 +16,25 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from .geometry import Array, invert_pose, transform_points
+from .geometry import Array, invert_pose, make_pose, project, transform_points
 from .raster import render_depth
-from .region_kernels import collect_lines, free_lengths, measure_lines
+from .region_kernels import (
+    count_bins,
+    free_lengths,
+    learn_lines,
+    measure_lines,
+    smooth_histogram,
+    solve_pose,
+    strongest_gradient,
+)
 from .video import Image
 
 BITS = 4  # colour resolution per channel of the local histograms
 BINS = 1 << (3 * BITS)
 LOCAL_CENTRES = 48
 CLEAR_EDGE = 24.0  # grey levels per px
+SAME_SIDE, SAME_SIZE = float(np.cos(np.deg2rad(1.5))), 0.05  # of views that one outline serves
+POINT_LIMIT_PX = 3.0
 NO_EDGES = np.zeros((0, 0, 2), np.float32)
 
 
@@ -50,17 +60,21 @@ class TrackingMesh:
 
 @dataclass(frozen=True)
 class Outline:
-    """Sampled outline of the mesh at one pose.
+    """Sampled outline of the mesh, drawn at one pose and moved along with poses seen from nearly the same side.
 
-    pixel: (N, 2) image position.  normal: (N, 2) unit, outward.  point_object_m: (N, 3).
+    pixel: (N, 2) image position.  normal: (N, 2) unit, outward.  point_object_m, normal_object: (N, 3).
     inside_px, outside_px: (N,) free length of the line before the silhouette ends or begins again.
+    nearest: (N, 3) the mesh's centres nearest to each point.  T_drawn: (4, 4) the pose it was drawn at.
     """
 
     pixel: Array
     normal: Array
     point_object_m: Array
+    normal_object: Array
     inside_px: NDArray[np.float32]
     outside_px: NDArray[np.float32]
+    nearest: NDArray[np.int32]
+    T_drawn: Array
 
     def __len__(self) -> int:
         return len(self.pixel)
@@ -68,8 +82,46 @@ class Outline:
     def select(self, keep: NDArray[np.bool_]) -> Outline:
         """The lines where `keep` (N,) is true."""
         return Outline(
-            self.pixel[keep], self.normal[keep], self.point_object_m[keep], self.inside_px[keep], self.outside_px[keep]
-        )
+            self.pixel[keep], self.normal[keep], self.point_object_m[keep], self.normal_object[keep],
+            self.inside_px[keep], self.outside_px[keep], self.nearest[keep], self.T_drawn,
+        )  # fmt: skip
+
+    def inside(self, image_shape: tuple[int, int]) -> Outline | None:
+        """The lines whose feet are in an image (height, width); None when fewer than 12 are."""
+        x, y = self.pixel.T
+        keep = (x >= 2) & (x < image_shape[1] - 2) & (y >= 2) & (y < image_shape[0] - 2)
+        return self.select(keep) if np.count_nonzero(keep) >= 12 else None
+
+    def serves(self, T_camera_object: Array) -> bool:
+        """Whether the object shows nearly the same side and size at a pose as where the outline was drawn."""
+        towards, drawn = (T[:3, :3].T @ T[:3, 3] for T in (T_camera_object, self.T_drawn))
+        far, far_drawn = float(np.linalg.norm(towards)), float(np.linalg.norm(drawn))
+        return bool(towards @ drawn > SAME_SIDE * far * far_drawn and abs(far / far_drawn - 1) < SAME_SIZE)
+
+    def moved(self, T_camera_object: Array, camera_matrix: Array) -> Outline:
+        """The same points of the mesh where another pose and camera show them."""
+        pixel = project(camera_matrix, transform_points(T_camera_object, self.point_object_m))
+        normal = self.normal_object @ T_camera_object[:2, :3].T
+        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
+        return replace(self, pixel=pixel, normal=normal)
+
+
+@dataclass(frozen=True)
+class Points:
+    """Points of the mesh seen at known places: object_m (N, 3), pixel (N, 2), weight (N,) inverse variance in px^-2."""
+
+    object_m: Array
+    pixel: Array
+    weight: Array
+
+    @staticmethod
+    def none() -> Points:
+        return Points(np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0))
+
+    def errors_px(self, T_camera_object: Array, camera_matrix: Array) -> Array:
+        """(N,) distances from where a pose puts the points."""
+        seen = project(camera_matrix, transform_points(T_camera_object, self.object_m))
+        return np.asarray(np.linalg.norm(seen - self.pixel, axis=1))
 
 
 class ColourModel:
@@ -89,41 +141,23 @@ class ColourModel:
     def start_global(self, foreground: NDArray[np.int32], background: NDArray[np.int32]) -> None:
         """Set the global histograms (row LOCAL_CENTRES) from colour bins of labelled pixels."""
         for histogram, bins in ((self.foreground, foreground), (self.background, background)):
-            histogram[-1] = _smooth(np.bincount(bins, minlength=BINS).astype(np.float32))
+            histogram[-1] = np.bincount(bins, minlength=BINS)
+            smooth_histogram(histogram[-1], 1 << BITS)
         self.seen[-1] = 1.0
 
-    def update(self, outline: Outline, mesh: TrackingMesh, bins: NDArray[np.int32], rate: float) -> None:
+    def update(self, outline: Outline, bins: NDArray[np.int32], rate: float) -> None:
         """Learn from the lines of a converged outline; `bins` is the (H, W) image of colour bins."""
-        if len(outline) == 0:
-            return
-        nearest = mesh.tree.query(outline.point_object_m, k=2)[1].astype(np.int32)
-        fresh_f = np.zeros_like(self.foreground)
-        fresh_b = np.zeros_like(self.background)
-        collect_lines(
-            outline.pixel, outline.normal, outline.inside_px, outline.outside_px, nearest, bins, fresh_f, fresh_b
-        )
-        touched = (fresh_f.sum(axis=1) > 20) & (fresh_b.sum(axis=1) > 20)
-        for k in np.flatnonzero(touched):
-            f, b = _smooth(fresh_f[k]), _smooth(fresh_b[k])
-            a = rate if self.seen[k] else 1.0
-            self.foreground[k] = (1 - a) * self.foreground[k] + a * f
-            self.background[k] = (1 - a) * self.background[k] + a * b
-            self.seen[k] = 1.0
+        learn_lines(
+            outline.pixel, outline.normal, outline.inside_px, outline.outside_px, outline.nearest, bins,
+            self.foreground, self.background, self.seen, rate,
+        )  # fmt: skip
 
 
 def edge_strength(rgb: Image) -> NDArray[np.float32]:
     """(H, W, 2) image gradient, the largest of the three channels, scaled so that a clear edge has length 1."""
-    blurred = cv2.GaussianBlur(rgb, (0, 0), 1.0)
-    x, y = (cv2.split(cv2.Sobel(blurred, cv2.CV_32F, *order, scale=1 / 8)) for order in ((1, 0), (0, 1)))
-    best_x, best_y = x[0], y[0]
-    best = best_x * best_x + best_y * best_y
-    for gx, gy in zip(x[1:], y[1:], strict=True):
-        square = gx * gx + gy * gy
-        stronger = square > best
-        best = np.where(stronger, square, best)
-        best_x, best_y = np.where(stronger, gx, best_x), np.where(stronger, gy, best_y)
-    strongest = np.stack([best_x, best_y], axis=-1)
-    return np.asarray(strongest / CLEAR_EDGE, np.float32)
+    strength = np.empty((*rgb.shape[:2], 2), np.float32)
+    strongest_gradient(np.asarray(cv2.GaussianBlur(rgb, (0, 0), 1.0), np.uint8), 1 / (8 * CLEAR_EDGE), strength)
+    return strength
 
 
 def mask_evidence(mask: NDArray[np.bool_]) -> tuple[NDArray[np.int32], ColourModel]:
@@ -139,9 +173,9 @@ def mask_evidence(mask: NDArray[np.bool_]) -> tuple[NDArray[np.int32], ColourMod
 
 def colour_bins(rgb: Image) -> NDArray[np.int32]:
     """(H, W) histogram bin of every pixel."""
-    shift = 8 - BITS
-    r, g, b = (rgb[..., k].astype(np.int32) >> shift for k in range(3))
-    return (r << (2 * BITS)) | (g << BITS) | b
+    bins = np.empty(rgb.shape[:2], np.int32)
+    count_bins(rgb, BITS, bins)
+    return bins
 
 
 def extract_outline(
@@ -152,6 +186,12 @@ def extract_outline(
     count: int = 300,
 ) -> Outline | None:
     """Sample the silhouette's outer boundary inside the image; None when the object cannot be drawn."""
+    outline = draw_outline(mesh, T_camera_object, camera_matrix, count)
+    return None if outline is None else outline.inside(image_shape)
+
+
+def draw_outline(mesh: TrackingMesh, T_camera_object: Array, camera_matrix: Array, count: int = 300) -> Outline | None:
+    """Sample the whole boundary of the silhouette, in the image or not; None when the object cannot be drawn."""
     window = render_depth(mesh.vertices_m, mesh.faces, T_camera_object, camera_matrix, margin_px=24)
     if window is None:
         return None
@@ -160,20 +200,15 @@ def extract_outline(
     contours = [c for c in contours if len(c) >= 8]
     if not contours:
         return None
-    # A smooth signed distance gives stable normals where the pixel outline is ragged.
-    signed = cv2.distanceTransform(1 - mask, cv2.DIST_L2, 5) - cv2.distanceTransform(mask, cv2.DIST_L2, 5)
-    signed = cv2.GaussianBlur(np.asarray(signed, np.float32), (0, 0), 1.2)
-    grad_x, grad_y = cv2.Sobel(signed, cv2.CV_32F, 1, 0), cv2.Sobel(signed, cv2.CV_32F, 0, 1)
     contour = np.concatenate(contours)[:, 0, :]
-    height, width = image_shape
-    x, y = contour[:, 0] + window.x0_px, contour[:, 1] + window.y0_px
-    keep = (x >= 2) & (x < width - 2) & (y >= 2) & (y < height - 2) & (window.depth_m[contour[:, 1], contour[:, 0]] > 0)
-    contour = contour[keep]
+    contour = contour[window.depth_m[contour[:, 1], contour[:, 0]] > 0]  # holes are traced along their outside
     if len(contour) < 12:
         return None
     contour = contour[np.linspace(0, len(contour) - 1, min(count, len(contour))).round().astype(int)]
+    # A blurred silhouette gives stable normals where the pixel outline is ragged.
+    soft = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), 2.0)
     cx, cy = contour[:, 0], contour[:, 1]
-    normal = np.stack([grad_x[cy, cx], grad_y[cy, cx]], axis=1).astype(float)
+    normal = np.stack([soft[cy, cx - 1] - soft[cy, cx + 1], soft[cy - 1, cx] - soft[cy + 1, cx]], axis=1).astype(float)
     length = np.linalg.norm(normal, axis=1, keepdims=True)
     good = length[:, 0] > 1e-3
     contour, normal = contour[good], normal[good] / length[good]
@@ -185,7 +220,9 @@ def extract_outline(
     points = transform_points(invert_pose(T_camera_object), rays * z[:, None])
     inside, outside = np.zeros(len(z), np.float32), np.zeros(len(z), np.float32)
     free_lengths(contour.astype(np.float64), normal, mask, inside, outside)
-    return Outline(pixel, normal, points, inside, outside)
+    nearest = mesh.tree.query(points, k=3)[1].astype(np.int32)
+    normal_object = normal @ T_camera_object[:2, :3]
+    return Outline(pixel, normal, points, normal_object, inside, outside, nearest, T_camera_object)
 
 
 @dataclass(frozen=True)
@@ -226,10 +263,9 @@ def measure(
     outline = outline or extract_outline(mesh, T_camera_object, camera_matrix, (bins.shape[0], bins.shape[1]))
     if outline is None:
         return None
-    nearest = mesh.tree.query(outline.point_object_m, k=3)[1].astype(np.int32)
     mean_px, variance, gain = np.zeros(len(outline)), np.zeros(len(outline)), np.zeros(len(outline))
     measure_lines(
-        outline.pixel, outline.normal, outline.inside_px, outline.outside_px, nearest, bins,
+        outline.pixel, outline.normal, outline.inside_px, outline.outside_px, outline.nearest, bins,
         colours.foreground, colours.background, colours.seen, NO_EDGES if edges is None else edges,
         step_px, mean_px, variance, gain,
     )  # fmt: skip
@@ -243,12 +279,19 @@ def measure(
 
 @dataclass(frozen=True)
 class Refinement:
-    """Result of `refine`: the pose, the mean log-likelihood ratio per line (higher is better) and lines used."""
+    """Result of `refine`: the pose, the mean log-likelihood ratio per line (higher is better) and lines used.
+
+    information: (6, 6) Gauss-Newton information in px^-2, rotation first.  outline: the last one drawn, uncut.
+    strain: by how much the points made the lines fit worse, in squared standard deviations a line: more than noise
+    when points and outline contradict each other.
+    """
 
     T_camera_object: Array
     score: float
     lines: int
-    information: Array  # (6, 6) Gauss-Newton information in px^-2, rotation first
+    information: Array
+    outline: Outline | None = None
+    strain: float = 0.0
 
 
 def refine(
@@ -264,48 +307,64 @@ def refine(
     prior_translation: float = 0.02,
     prior_depth: float = 0.01,
     prior_spin_rad: float | None = None,
+    spin_axis: tuple[float, float, float] = (0.0, 0.0, 1.0),
     edges: NDArray[np.float32] | None = None,
+    points: Points | None = None,
+    outline: Outline | None = None,
 ) -> Refinement:
     """Refine a pose against one image.
 
     bins: (H, W) from `colour_bins`.  steps_px: sample spacing along the lines for each outer pass, coarse to fine.
     prior_*: standard deviation of the start pose, rotation in rad, translation as a fraction of the distance,
     sideways and along the viewing ray: directions the outline does not show stay where they were.
-    prior_spin_rad: the same for turns about the object's own +z, where it differs.
+    prior_spin_rad: the same for turns about the object's own `spin_axis`, where it differs.
     edges: (H, W, 2) from `edge_strength`, to weigh image edges in with the colours; None for colours alone.
+    points: what else must fit, in the same least squares.  outline: drawn before, used while it serves.
     """
     T_start: Array = T_camera_object.copy()
     T: Array = T_camera_object.copy()
-    score, count = -np.inf, 0
+    points = points or Points.none()
+    score, count, strain = -np.inf, 0, 0.0
     information: Array = np.zeros((6, 6))
-    distance = float(np.linalg.norm(T_start[:3, 3]))
-    ray = T_start[:3, 3] / distance
-    weight_t: Array = np.eye(3) / (prior_translation * distance) ** 2
-    weight_t += np.outer(ray, ray) * (1 / (prior_depth * distance) ** 2 - 1 / (prior_translation * distance) ** 2)
-    prior: Array = np.zeros((6, 6))
-    prior[:3, :3] = np.eye(3) / prior_rotation_rad**2
-    if prior_spin_rad is not None:
-        up = T_start[:3, 2]
-        prior[:3, :3] += np.outer(up, up) * (1 / prior_spin_rad**2 - 1 / prior_rotation_rad**2)
-    prior[3:, 3:] = weight_t
-    for step_px in steps_px:
-        lines = measure(mesh, T, camera_matrix, bins, colours, step_px, edges)
+    up = T_start[:3, :3] @ np.asarray(spin_axis)
+    prior = _prior(T_start, up, prior_rotation_rad, prior_spin_rad, prior_translation, prior_depth)
+
+    def solved(lines: Lines, weight: Array) -> tuple[Array, Array, float]:
+        inverse_variance, turn, shift = 1.0 / lines.variance_px2, T[:3, :3].copy(), T[:3, 3].copy()
+        found = np.zeros((6, 6))
+        cost = solve_pose(
+            lines.outline.point_object_m, lines.target_px, lines.outline.normal, inverse_variance, lines.step_px,
+            points.object_m, points.pixel, weight, POINT_LIMIT_PX, camera_matrix, T_start, prior, iterations,
+            turn, shift, found,
+        )  # fmt: skip
+        return make_pose(Rotation.from_matrix(turn).as_matrix(), shift), found, float(cost)
+
+    for number, step_px in enumerate(steps_px):
+        if outline is None or not outline.serves(T):
+            outline = draw_outline(mesh, T, camera_matrix)
+        here = None if outline is None else outline.moved(T, camera_matrix).inside((bins.shape[0], bins.shape[1]))
+        lines = None if here is None else measure(mesh, T, camera_matrix, bins, colours, step_px, edges, here)
         if lines is None:
             break
         score, count = float(np.mean(lines.gain)), len(lines.gain)
-        for _ in range(iterations):
-            offset_px, jacobian = lines.residuals(T, camera_matrix)
-            w = lines.weights(offset_px)
-            information = (jacobian * w[:, None]).T @ jacobian
-            gradient = jacobian.T @ (w * offset_px) - prior @ _twist(T_start, T)
-            delta = np.linalg.solve(information + prior, gradient)
-            T = T.copy()
-            T[:3, :3] = Rotation.from_rotvec(delta[:3]).as_matrix() @ T[:3, :3]
-            T[:3, 3] += delta[3:]
-            if np.abs(delta).max() < 1e-6:
-                break
-        T[:3, :3] = Rotation.from_matrix(T[:3, :3]).as_matrix()
-    return Refinement(T, score, count, information)
+        last = number == len(steps_px) - 1
+        alone = solved(lines, np.zeros_like(points.weight))[2] if last and len(points.weight) else 0.0
+        T, information, cost = solved(lines, points.weight)
+        strain = (cost - alone) / count if alone else 0.0
+    return Refinement(T, score, count, information, outline, strain)
+
+
+def _prior(T: Array, up: Array, rotation_rad: float, spin_rad: float | None, sideways: float, depth: float) -> Array:
+    """(6, 6) information of a start pose whose spin is about `up`, see `refine`."""
+    distance = float(np.linalg.norm(T[:3, 3]))
+    ray = T[:3, 3] / distance
+    prior: Array = np.zeros((6, 6))
+    prior[:3, :3] = np.eye(3) / rotation_rad**2
+    if spin_rad is not None:
+        prior[:3, :3] += np.outer(up, up) * (1 / spin_rad**2 - 1 / rotation_rad**2)
+    prior[3:, 3:] = np.eye(3) / (sideways * distance) ** 2
+    prior[3:, 3:] += np.outer(ray, ray) * (1 / (depth * distance) ** 2 - 1 / (sideways * distance) ** 2)
+    return prior
 
 
 def farthest_points(points: Array, count: int) -> Array:
@@ -316,12 +375,6 @@ def farthest_points(points: Array, count: int) -> Array:
         chosen.append(int(np.argmax(distance)))
         distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
     return np.asarray(points[chosen])
-
-
-def _twist(T_a: Array, T_b: Array) -> Array:
-    """Rotation vector and translation from pose a to pose b, both in the camera frame, about the object's origin."""
-    rotation = Rotation.from_matrix(T_b[:3, :3] @ T_a[:3, :3].T).as_rotvec()
-    return np.concatenate([rotation, T_b[:3, 3] - T_a[:3, 3]])
 
 
 def _normal_residuals(
@@ -337,15 +390,3 @@ def _normal_residuals(
     jacobian = np.concatenate([np.cross(camera_points - centre, gradient), gradient], axis=1)
     offset = np.sum(normal * (target - np.stack([u, v], axis=1)), axis=1)
     return offset, jacobian
-
-
-def _smooth(histogram: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Normalised histogram spread over neighbouring bins, so that small samples do not overfit."""
-    side = 1 << BITS
-    cube = histogram.reshape(side, side, side)
-    for axis in range(3):
-        padded = np.pad(cube, [(1, 1) if a == axis else (0, 0) for a in range(3)])
-        low, high = (padded.take(range(s, s + side), axis=axis) for s in (0, 2))
-        cube = 0.5 * cube + 0.25 * (low + high)
-    flat = cube.reshape(-1)
-    return np.asarray(flat / max(float(flat.sum()), 1e-12), np.float32)

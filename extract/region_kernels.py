@@ -15,6 +15,7 @@ from .geometry import Array
 HALF_LINE = 10  # samples on either side of the outline
 # An outline on a clear image edge is this much likelier than one on none; steps beyond 2 px would miss edges.
 EDGE_WEIGHT, EDGE_FLOOR, EDGE_STEP_PX = 1.0, 0.2, 2.0
+HIDDEN = 0.01  # of the distance: farther behind the visible surface is another one
 AMPLITUDE, SLOPE = 0.40, 1.0  # of the smooth step between inside and outside (SRT3D, eq. 13)
 INSIDE_SHARE = 0.5 - AMPLITUDE * np.tanh(np.arange(-2 * HALF_LINE, 2 * HALF_LINE + 1) / (2.0 * SLOPE))
 
@@ -45,20 +46,73 @@ def free_lengths(
 
 
 @numba.njit(cache=True)
-def collect_lines(
+def count_bins(rgb: NDArray[np.uint8], bits: int, bins: NDArray[np.int32]) -> None:
+    """Histogram bin of every pixel of (H, W, 3), `bits` a channel, into `bins` (H, W)."""
+    shift = 8 - bits
+    for y in range(rgb.shape[0]):
+        for x in range(rgb.shape[1]):
+            r, g, b = np.int32(rgb[y, x, 0]), np.int32(rgb[y, x, 1]), np.int32(rgb[y, x, 2])
+            bins[y, x] = ((r >> shift) << (2 * bits)) | ((g >> shift) << bits) | (b >> shift)
+
+
+@numba.njit(cache=True)
+def strongest_gradient(rgb: NDArray[np.uint8], scale: float, out: NDArray[np.float32]) -> None:
+    """Sobel gradient times `scale` of the channel where it is longest, (H, W, 2); 0 at the image's border."""
+    h, w = rgb.shape[:2]
+    out[:] = 0.0
+    for y in range(1, h - 1):
+        for x in range(1, w - 1):
+            best = -1
+            for c in range(3):
+                nw, ne = np.int32(rgb[y - 1, x - 1, c]), np.int32(rgb[y - 1, x + 1, c])
+                sw, se = np.int32(rgb[y + 1, x - 1, c]), np.int32(rgb[y + 1, x + 1, c])
+                gx = ne + se - nw - sw + 2 * (np.int32(rgb[y, x + 1, c]) - np.int32(rgb[y, x - 1, c]))
+                gy = sw + se - nw - ne + 2 * (np.int32(rgb[y + 1, x, c]) - np.int32(rgb[y - 1, x, c]))
+                square = int(gx * gx + gy * gy)
+                if square > best:
+                    best = square
+                    out[y, x, 0], out[y, x, 1] = gx * scale, gy * scale
+
+
+@numba.njit(cache=True)
+def smooth_histogram(histogram: NDArray[np.float32], side: int) -> None:
+    """Normalise a histogram of side^3 bins, spread over neighbouring bins so that small samples do not overfit."""
+    total = np.float32(0.0)
+    for stride in (1, side, side * side):
+        for start in range(side**3):
+            if (start // stride) % side:
+                continue
+            before = np.float32(0.0)
+            for k in range(side):
+                at = start + k * stride
+                here = histogram[at]
+                after = histogram[at + stride] if k + 1 < side else np.float32(0.0)
+                histogram[at] = np.float32(0.5) * here + np.float32(0.25) * (before + after)
+                before = here
+    for k in range(side**3):
+        total += histogram[k]
+    histogram /= max(total, np.float32(1e-12))
+
+
+@numba.njit(cache=True)
+def learn_lines(
     pixel: Array, normal: Array, inside: NDArray[np.float32], outside: NDArray[np.float32],
     nearest: NDArray[np.int32], bins: NDArray[np.int32],
-    fresh_f: NDArray[np.float32], fresh_b: NDArray[np.float32],
+    hist_f: NDArray[np.float32], hist_b: NDArray[np.float32], seen: NDArray[np.float32], rate: float,
 ) -> None:  # fmt: skip
-    """Count the colours on either side of the outline into the histograms of each line's nearest centres.
+    """Blend the colours on either side of the outline into the histograms (K, BINS) of each line's nearest centres.
 
-    The last row of `fresh_f` (inside) and `fresh_b` (outside), (K, BINS), counts the lines of all centres.
+    `rate` is the share of what is new; a centre not seen before takes all of it. The last row holds all centres.
     """
     h, w = bins.shape
-    last = fresh_f.shape[0] - 1
+    last = hist_f.shape[0] - 1
+    side = round(hist_f.shape[1] ** (1 / 3))
+    fresh = np.zeros((2, hist_f.shape[0], hist_f.shape[1]), np.float32)
+    counts = np.zeros((2, hist_f.shape[0]), np.int64)
     for i in range(pixel.shape[0]):
-        for direction in (-1, 1):
-            reach = min(inside[i] - 1.0, 16.0) if direction < 0 else min(outside[i] - 1.0, 16.0)
+        for which in range(2):
+            direction = -1 if which == 0 else 1
+            reach = min((inside[i] if which == 0 else outside[i]) - 1.0, 16.0)
             r = 1.5
             while r <= reach:
                 x = round(pixel[i, 0] + direction * r * normal[i, 0])
@@ -67,15 +121,20 @@ def collect_lines(
                 if x < 0 or y < 0 or x >= w or y >= h:
                     break
                 b = bins[y, x]
-                for k in nearest[i]:
-                    if direction < 0:
-                        fresh_f[k, b] += 1.0
-                    else:
-                        fresh_b[k, b] += 1.0
-                if direction < 0:
-                    fresh_f[last, b] += 1.0
-                else:
-                    fresh_b[last, b] += 1.0
+                for j in range(3):
+                    k = last if j == 2 else np.int64(nearest[i, j])
+                    fresh[which, k, b] += 1.0
+                    counts[which, k] += 1
+    for k in range(last + 1):
+        if counts[0, k] <= 20 or counts[1, k] <= 20:
+            continue
+        a = np.float32(rate if seen[k] > 0 else 1.0)
+        smooth_histogram(fresh[0, k], side)
+        smooth_histogram(fresh[1, k], side)
+        for b in range(hist_f.shape[1]):
+            hist_f[k, b] += a * (fresh[0, k, b] - hist_f[k, b])
+            hist_b[k, b] += a * (fresh[1, k, b] - hist_b[k, b])
+        seen[k] = 1.0
 
 
 @numba.njit(cache=True)
@@ -146,3 +205,139 @@ def measure_lines(
         mean_px[i] = mean
         variance[i] = max(second / weight - mean * mean, 0.25 * step_px * step_px)
         gain[i] = (log_p[HALF_LINE] - 0.5 * (log_p[0] + log_p[n - 1])) / n
+
+
+@numba.njit(cache=True)
+def solve_pose(
+    line_point: Array, target: Array, normal: Array, inverse_variance: Array, step_px: float,
+    point: Array, pixel: Array, point_weight: Array, point_limit_px: float, camera_matrix: Array,
+    T_start: Array, prior: Array, iterations: int, R: Array, t: Array, information: Array,
+) -> float:  # fmt: skip
+    """Gauss-Newton on SE(3) over lines (N) and points (M); R (3, 3) and t (3,) are moved, turns are about the object.
+
+    Lines that disagree with the rest (occluders, shadows) count less; points off by `point_limit_px` hardly count.
+    prior: (6, 6) information of T_start.  information: (6, 6), written, of lines and points, rotation first.
+    Returns the lines' own robust cost at the end.
+    """
+    fx, fy, cx, cy = camera_matrix[0, 0], camera_matrix[1, 1], camera_matrix[0, 2], camera_matrix[1, 2]
+    row, gradient = np.empty(6), np.empty(6)
+    limit2 = (4.0 * step_px) ** 2
+    cost = 0.0
+    for iteration in range(iterations + 1):
+        information[:] = 0.0
+        gradient[:] = 0.0
+        cost = 0.0
+        for i in range(line_point.shape[0] + 2 * point.shape[0]):
+            m = (i - line_point.shape[0]) // 2
+            X = line_point[i] if m < 0 else point[m]
+            ax = R[0, 0] * X[0] + R[0, 1] * X[1] + R[0, 2] * X[2]
+            ay = R[1, 0] * X[0] + R[1, 1] * X[1] + R[1, 2] * X[2]
+            az = R[2, 0] * X[0] + R[2, 1] * X[1] + R[2, 2] * X[2]
+            x, y, z = ax + t[0], ay + t[1], az + t[2]
+            if z < 1e-4:
+                continue
+            u, v = fx * x / z + cx, fy * y / z + cy
+            if m < 0:
+                nx, ny = normal[i, 0], normal[i, 1]
+                offset = nx * (target[i, 0] - u) + ny * (target[i, 1] - v)
+                square = offset * offset / limit2
+                cost += inverse_variance[i] * limit2 * np.log(1.0 + square)
+                weight = inverse_variance[i] / (1.0 + square)
+            else:
+                du, dv = pixel[m, 0] - u, pixel[m, 1] - v
+                first = (i - line_point.shape[0]) % 2 == 0
+                nx, ny = (1.0, 0.0) if first else (0.0, 1.0)
+                offset = du if first else dv
+                weight = point_weight[m] / (1.0 + (du * du + dv * dv) / point_limit_px**2) ** 2
+            gx, gy = nx * fx / z, ny * fy / z
+            gz = -(nx * fx * x + ny * fy * y) / (z * z)
+            row[0], row[1], row[2] = ay * gz - az * gy, az * gx - ax * gz, ax * gy - ay * gx
+            row[3], row[4], row[5] = gx, gy, gz
+            for a in range(6):
+                gradient[a] += weight * offset * row[a]
+                for b in range(6):
+                    information[a, b] += weight * row[a] * row[b]
+        if iteration == iterations:
+            break
+        twist = np.empty(6)
+        twist[:3] = _log(R, T_start[:3, :3])
+        twist[3:] = t - T_start[:3, 3]
+        delta = np.linalg.solve(information + prior, gradient - prior @ twist)
+        step = delta[:3]
+        R[:] = np.dot(_exp(step), R)
+        t += delta[3:]
+        if np.abs(delta).max() < 1e-6:
+            break
+    return cost
+
+
+@numba.njit(cache=True)
+def _exp(turn: Array) -> Array:
+    """Rotation (3, 3) by a rotation vector (3,)."""
+    angle = np.sqrt(np.sum(turn * turn))
+    K = np.array([[0.0, -turn[2], turn[1]], [turn[2], 0.0, -turn[0]], [-turn[1], turn[0], 0.0]])
+    if angle < 1e-8:
+        small: Array = np.eye(3) + K
+        return small
+    whole: Array = np.eye(3) + np.sin(angle) / angle * K + (1.0 - np.cos(angle)) / (angle * angle) * (K @ K)
+    return whole
+
+
+@numba.njit(cache=True)
+def _log(R: Array, R_from: Array) -> Array:
+    """Rotation vector (3,) of the turn from one rotation to another, by less than half a turn."""
+    turn = np.zeros((3, 3))
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                turn[i, j] += R[i, k] * R_from[j, k]
+    axis: Array = 0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+    sine = np.sqrt(np.sum(axis * axis))
+    if sine > 1e-8:
+        axis *= np.arctan2(sine, 0.5 * (turn[0, 0] + turn[1, 1] + turn[2, 2] - 1.0)) / sine
+    return axis
+
+
+@numba.njit(cache=True)
+def draw_view(
+    depth: NDArray[np.float32], x0: int, y0: int, camera_matrix: Array, T_key_camera: Array,
+    key_depth: NDArray[np.float32], key_x0: int, key_y0: int, key_picture: NDArray[np.uint8], key_camera: Array,
+    drawn: NDArray[np.uint8], covered: NDArray[np.uint8],
+) -> None:  # fmt: skip
+    """Carry a key view's picture over the mesh into another view: `drawn` (H, W), `covered` 255 where it was.
+
+    depth, key_depth: of the mesh in windows of either picture.  T_key_camera: (4, 4) this camera in the key's frame.
+    What the key view did not see, because it lay behind something or out of the picture, stays as it was.
+    """
+    h, w = drawn.shape
+    kh, kw = key_picture.shape
+    fx, fy, cx, cy = camera_matrix[0, 0], camera_matrix[1, 1], camera_matrix[0, 2], camera_matrix[1, 2]
+    for j in range(depth.shape[0]):
+        y = j + y0
+        if y < 0 or y >= h:
+            continue
+        for i in range(depth.shape[1]):
+            x, z = i + x0, float(depth[j, i])
+            if z <= 0.0 or x < 0 or x >= w:
+                continue
+            px, py = (x - cx) / fx * z, (y - cy) / fy * z
+            qx = T_key_camera[0, 0] * px + T_key_camera[0, 1] * py + T_key_camera[0, 2] * z + T_key_camera[0, 3]
+            qy = T_key_camera[1, 0] * px + T_key_camera[1, 1] * py + T_key_camera[1, 2] * z + T_key_camera[1, 3]
+            qz = T_key_camera[2, 0] * px + T_key_camera[2, 1] * py + T_key_camera[2, 2] * z + T_key_camera[2, 3]
+            if qz < 1e-4:
+                continue
+            u = key_camera[0, 0] * qx / qz + key_camera[0, 2]
+            v = key_camera[1, 1] * qy / qz + key_camera[1, 2]
+            a, b = int(np.floor(u)), int(np.floor(v))
+            if a < 0 or b < 0 or a + 1 >= kw or b + 1 >= kh:
+                continue
+            c, d = int(np.floor(u + 0.5)) - key_x0, int(np.floor(v + 0.5)) - key_y0
+            if c < 0 or d < 0 or c >= key_depth.shape[1] or d >= key_depth.shape[0]:
+                continue
+            if abs(key_depth[d, c] - qz) > HIDDEN * qz:
+                continue
+            s, t = u - a, v - b
+            top = (1.0 - s) * key_picture[b, a] + s * key_picture[b, a + 1]
+            bottom = (1.0 - s) * key_picture[b + 1, a] + s * key_picture[b + 1, a + 1]
+            drawn[y, x] = np.uint8((1.0 - t) * top + t * bottom + 0.5)
+            covered[y, x] = 255

@@ -18,7 +18,7 @@ from .region import ColourModel, TrackingMesh
 
 SPINS = 48
 EVIDENCE_RANGE = (-1.0, 2.0)  # log-odds; skin over a handle must not outvote the frames that show the handle
-TURN_COST = 0.02  # of a turn by one step between neighbouring samples, in mean log-odds over the object's area
+TURN_COST = 0.03  # of a turn by one step between neighbouring samples, in mean log-odds over the object's area
 
 
 def object_evidence(bins: NDArray[np.int32], colours: ColourModel) -> NDArray[np.float32]:

@@ -1,8 +1,13 @@
-"""Follow one object from frame to frame: predict, refine against the frame, learn its colours, judge the result."""
+"""Follow one object from frame to frame: predict, refine against the frame, learn from it, judge the result.
+
+The outline against learned colours (region.py) and textured points (texture.py) move the pose in one least squares.
+Only the part of the frame around the prediction is looked at; the whole of it when the object is lost.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -10,107 +15,266 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from .first_pose import share_on_edges
-from .geometry import Array, project, transform_points
-from .region import ColourModel, Outline, TrackingMesh, colour_bins, edge_strength, extract_outline, measure, refine
+from .geometry import Array, Symmetry, make_pose, project, transform_points
+from .raster import render_depth
+from .region import ColourModel, Outline, TrackingMesh, colour_bins, draw_outline, edge_strength, measure, refine
 from .segment import Mask
+from .spin import object_evidence
+from .texture import NO_MATCHES, Matches, Texture, flattened
 from .video import Image
 
 LEARNING_RATE = 0.15
-LEARN_ABOVE = 0.35  # a frame the tracker is unsure of teaches it nothing
+LEARN_ABOVE = 0.4  # a frame the tracker is unsure of teaches it nothing
+KEY_ABOVE = 0.6
 LOST_BELOW = 0.2
+FOUND_ABOVE = 0.4  # what was lost must be surer to be found than what is held must be to be kept
 VELOCITY_KEPT = 0.7  # hands accelerate: half-trusting the last velocity beats trusting it or ignoring it
-SEARCH_STEPS_PX = (9.0, 7.0, 5.0, 3.0, 2.0, 1.0)
+COARSE_PX, FINE_PX, SEARCH_PX = (5.0, 3.0, 2.0, 1.0, 1.0), (2.0, 1.0, 1.0), (9.0, 7.0, 5.0, 3.0, 2.0, 1.0)
+TRUSTED = 0.5  # texture that may start a frame's refinement and tell the spin of a body of revolution
+SURE_MATCHES = 20
+STILL_SPIN_RAD, HELD_SPIN_RAD = 1e-3, 0.01  # what cannot be seen; what the whole clip has told
+TEXTURED_SHARE = 0.3
+LOOK_AROUND = 0.3  # of the object's size, and LOOK_AROUND_PX
+LOOK_AROUND_PX = 50
+SEARCH_EVERY = 3  # frames, for what has been lost for long
+SEARCH_SCALE, SEARCH_PLACES, SEARCH_TURNS = 0.25, 3, 8
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Pose of the object in one frame, how sure it is in [0, 1], whether the object is in view, and its outline."""
+    """Pose of the object in one frame, how sure it is in [0, 1], and whether the object is in view."""
 
     T_camera_object: Array
     confidence: float
     visible: bool
+
+
+@dataclass(frozen=True)
+class Signs:
+    """What tells a good pose from a bad one, all in [0, 1].
+
+    agree: share of the outline's lines whose colours put it within 2 px.  on_edges: share of the outline on image
+    edges.  rigid: share of the textured points that move as the pose says, times how far texture is trusted.
+    """
+
+    agree: float
+    on_edges: float
+    rigid: float
+
+    @property
+    def confidence(self) -> float:
+        """Probability that the pose is right."""
+        return 0.5 * self.agree + 0.5 * self.on_edges
+
+
+@dataclass(frozen=True)
+class _Part:
+    """The part of a frame that is looked at, with the camera that sees it so."""
+
+    bins: NDArray[np.int32]
+    edges: NDArray[np.float32]
+    picture: NDArray[np.uint8]
+    camera_matrix: Array
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return self.bins.shape[0], self.bins.shape[1]
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """A refined pose with all that is learned from."""
+
+    T_camera_object: Array
+    confidence: float
     outline: Outline | None = None
+    matches: Matches = NO_MATCHES
+    strain: float = 0.0
+    signs: Signs = Signs(0.0, 0.0, 0.0)
 
 
 class ObjectTracker:
     """Tracks one mesh through the frames of one video, starting from a pose and a mask in one frame.
 
-    camera_matrix and all images are at the working resolution.
+    camera_matrix and all images are at the working resolution.  symmetry: of the mesh; about an axis of revolution
+    only texture can tell a turn, without it there is none.
     """
 
-    def __init__(self, mesh: TrackingMesh, camera_matrix: Array, rgb: Image, mask: Mask, T_camera_object: Array):
+    def __init__(
+        self,
+        mesh: TrackingMesh,
+        camera_matrix: Array,
+        rgb: Image,
+        mask: Mask,
+        T_camera_object: Array,
+        symmetry: Symmetry | None = None,
+    ):
         self.mesh, self.camera_matrix = mesh, camera_matrix
-        self.colours = ColourModel()
-        self._pose = self._before = T_camera_object
+        self.symmetry = symmetry or Symmetry()
+        self.colours, self.texture = ColourModel(), Texture(mesh)
+        self.signs = Signs(0.0, 0.0, 0.0)
+        self.textured_frames = 0
+        self._pose: Array = T_camera_object
+        self._velocity: Array = np.zeros(6)
+        self._lost_frames, self._size_px = 0, (rgb.shape[1], rgb.shape[0])
+        self._outline = draw_outline(mesh, T_camera_object, camera_matrix)
         bins = colour_bins(rgb)
         near = cv2.dilate(mask.astype(np.uint8), np.ones((41, 41), np.uint8)) > 0
         self.colours.start_global(bins[mask], bins[near & ~mask])
-        outline = extract_outline(mesh, T_camera_object, camera_matrix, (mask.shape[0], mask.shape[1]))
-        if outline is not None:
-            self.colours.update(outline, mesh, bins, 1.0)
+        inside = None if self._outline is None else self._outline.inside((mask.shape[0], mask.shape[1]))
+        if inside is not None:
+            self.colours.update(inside, bins, 1.0)
+        part = self._around(rgb, T_camera_object)
+        self.texture.keep(part.picture, part.camera_matrix, T_camera_object)
 
     def step(self, rgb: Image, guess: Array | None = None) -> Estimate:
         """Pose in the next frame, refined from `guess` or else from where the motion so far leads."""
-        bins = colour_bins(rgb)
-        strength = edge_strength(rgb)
-        best = self._refined(self._predicted() if guess is None else guess, bins, strength)
+        start = self._predicted() if guess is None else guess
+        part = self._around(rgb, start)
+        best = self._fitted(part, start, spin=0.02 if guess is None else HELD_SPIN_RAD)
         if best.confidence < LOST_BELOW and guess is None:
-            # A wider search, from the prediction and from where the object was seen last.
-            for start in (self._predicted(), self._pose):
-                wide = self._refined(start, bins, strength, SEARCH_STEPS_PX, freedom=3.0)
-                best = max(best, wide, key=lambda e: e.confidence)
-        if best.confidence >= LOST_BELOW:
-            self._before, self._pose = self._pose, best.T_camera_object
+            part = self._part(rgb, 0, 0, rgb.shape[1], rgb.shape[0])
+            best = self._searched(part, best, start)
+        self.signs = best.signs
+        if best.confidence < LOST_BELOW:
+            self._lost_frames += 1
+            if guess is None:
+                self._pose, self._velocity = start, VELOCITY_KEPT * self._velocity
+            return Estimate(start, best.confidence, False)
+        self._accept(best, part)
+        return Estimate(best.T_camera_object, best.confidence, True)
+
+    def _accept(self, fit: _Fit, part: _Part) -> None:
+        """Go on from a fit, and learn from it what it is sure enough to teach."""
+        T = fit.T_camera_object
+        if self._lost_frames == 0:
+            turn = Rotation.from_matrix(T[:3, :3] @ self._pose[:3, :3].T).as_rotvec()
+            self._velocity = np.concatenate([turn, T[:3, 3] - self._pose[:3, 3]])
         else:
-            self._before = self._pose
-            best = Estimate(self._pose if guess is None else guess, best.confidence, False)
-        if best.confidence >= LEARN_ABOVE and best.outline is not None:
-            self.colours.update(best.outline, self.mesh, bins, LEARNING_RATE)
-        return replace(best, outline=None)  # a clip's worth of outlines would be kept otherwise
+            self._velocity = np.zeros(6)
+        self._pose, self._lost_frames = T, 0
+        self.textured_frames += self._tells_spin(fit.matches)
+        self.texture.judge(fit.matches, fit.strain)
+        if fit.confidence >= LEARN_ABOVE and fit.outline is not None:
+            self.colours.update(fit.outline, part.bins, LEARNING_RATE)
+            if fit.confidence >= KEY_ABOVE:
+                self.texture.keep(part.picture, part.camera_matrix, T)
 
     def _predicted(self) -> Array:
-        """Constant velocity, damped."""
-        T = self._pose.copy()
-        T[:3, 3] += VELOCITY_KEPT * (self._pose[:3, 3] - self._before[:3, 3])
-        turn = Rotation.from_matrix(self._pose[:3, :3] @ self._before[:3, :3].T).as_rotvec()
-        T[:3, :3] = Rotation.from_rotvec(VELOCITY_KEPT * turn).as_matrix() @ T[:3, :3]
-        return T
+        """Constant velocity, damped; of the turn of a body of revolution only what can be seen."""
+        turn = self._velocity[:3]
+        if self.symmetry.order == 0 and self.texture.trust < TRUSTED:
+            axis = self._pose[:3, :3] @ np.asarray(self.symmetry.axis)
+            turn = turn - (turn @ axis) * axis
+        R = Rotation.from_rotvec(VELOCITY_KEPT * turn).as_matrix() @ self._pose[:3, :3]
+        return make_pose(R, self._pose[:3, 3] + VELOCITY_KEPT * self._velocity[3:])
 
-    def _refined(
-        self,
-        start: Array,
-        bins: NDArray[np.int32],
-        strength: NDArray[np.float32],
-        steps_px: tuple[float, ...] = (5.0, 3.0, 2.0, 1.0, 1.0),
-        freedom: float = 1.0,
-    ) -> Estimate:
+    def spin_source(self, frames: int) -> str:
+        """What told the turns about the symmetry axis or the upright axis: "texture", "outline" or "none"."""
+        if self.textured_frames > TEXTURED_SHARE * frames:
+            return "texture"
+        return "none" if self.symmetry.order == 0 else "outline"
+
+    def _tells_spin(self, matches: Matches) -> bool:
+        return len(matches) >= SURE_MATCHES and self.texture.trust >= TRUSTED
+
+    def _fitted(
+        self, part: _Part, start: Array, steps_px: Sequence[float] = COARSE_PX, freedom: float = 1.0, spin: float = 0.02
+    ) -> _Fit:
+        matches = self.texture.match(part.picture, part.camera_matrix, start)
+        sure = self._tells_spin(matches)
+        if sure and matches.T_camera_object is not None:
+            start, steps_px = matches.T_camera_object, FINE_PX
+        hidden_spin = self.symmetry.order == 0 and not sure
         result = refine(
-            self.mesh, start, self.camera_matrix, bins, self.colours, steps_px=steps_px,
-            prior_rotation_rad=0.03 * freedom, prior_spin_rad=0.02 * freedom,
+            self.mesh, start, part.camera_matrix, part.bins, self.colours, steps_px=tuple(steps_px),
+            prior_rotation_rad=0.03 * freedom, prior_spin_rad=STILL_SPIN_RAD if hidden_spin else spin * freedom,
+            spin_axis=self.symmetry.axis if self.symmetry.order == 0 else (0.0, 0.0, 1.0),
             prior_translation=0.02 * freedom, prior_depth=0.01 * freedom,
-            edges=strength,
+            edges=part.edges, points=matches.points, outline=self._outline,
         )  # fmt: skip
-        T = result.T_camera_object
-        in_view = self._share_in_view(T, bins.shape[1], bins.shape[0])
-        outline = extract_outline(self.mesh, T, self.camera_matrix, (bins.shape[0], bins.shape[1]))
+        T, self._outline = result.T_camera_object, result.outline
+        outline = None if self._outline is None else self._outline.moved(T, part.camera_matrix).inside(part.shape)
+        in_view = self._share_in_view(T)
         if in_view < 0.1 or outline is None:
-            return Estimate(T, 0.0, False)
-        confidence = self._confidence(T, outline, bins, strength) * min(1.0, 2 * in_view)
-        return Estimate(T, confidence, True, outline)
-
-    def _confidence(self, T: Array, outline: Outline, bins: NDArray[np.int32], strength: NDArray[np.float32]) -> float:
-        """Mean of two shares: lines whose colours put the outline within 2 px of it, and outline on image edges."""
-        lines = measure(self.mesh, T, self.camera_matrix, bins, self.colours, 1.0, outline=outline)
+            return _Fit(T, 0.0)
+        lines = measure(self.mesh, T, part.camera_matrix, part.bins, self.colours, 1.0, outline=outline)
         if lines is None:
-            return 0.0
-        offset_px, _ = lines.residuals(T, self.camera_matrix)
-        agree = np.mean((np.abs(offset_px) < 2.0) & (lines.variance_px2 < 9.0))
-        return float(0.5 * agree + 0.5 * share_on_edges(outline, strength))
+            return _Fit(T, 0.0)
+        offset_px, _ = lines.residuals(T, part.camera_matrix)
+        agree = float(np.mean((np.abs(offset_px) < 2.0) & (lines.variance_px2 < 9.0)))
+        rigid = 0.0
+        if len(matches):
+            held = np.mean(matches.points.errors_px(T, part.camera_matrix) < 2.0)
+            rigid = float(held * matches.rigid_share * self.texture.trust)
+        signs = Signs(agree, share_on_edges(outline, part.edges), rigid)
+        confidence = signs.confidence * min(1.0, 2 * in_view)
+        return _Fit(T, confidence, outline, matches, result.strain, signs)
 
-    def _share_in_view(self, T: Array, width: int, height: int) -> float:
-        """Share of the mesh's vertices that project into the image."""
-        points = transform_points(T, self.mesh.vertices_m)
+    def _searched(self, part: _Part, best: _Fit, predicted: Array) -> _Fit:
+        """The best of wider looks: around the prediction at first, then wherever the object's colours are."""
+        starts: list[Array] = [predicted] if self._lost_frames < SEARCH_EVERY else []
+        if self._lost_frames % SEARCH_EVERY == 0:
+            starts += self._places(part)
+        fits = [self._fitted(part, start, SEARCH_PX, freedom=3.0) for start in starts]
+        found = max(fits, key=lambda fit: fit.confidence, default=best)
+        if found.confidence >= (FOUND_ABOVE if self._lost_frames else LOST_BELOW):
+            return found
+        return best if best.confidence < LOST_BELOW else found
+
+    def _places(self, part: _Part) -> list[Array]:
+        """Poses whose silhouettes cover the object's colours best: rotations of key views, where the colours are."""
+        evidence = object_evidence(part.bins, self.colours)
+        small = cv2.resize(evidence, None, fx=SEARCH_SCALE, fy=SEARCH_SCALE, interpolation=cv2.INTER_AREA)
+        camera = np.diag([SEARCH_SCALE, SEARCH_SCALE, 1.0]) @ part.camera_matrix
+        depth_m = float(self._pose[2, 3])
+        reach = max(3, int(self.mesh.radius_m * camera[0, 0] / depth_m))
+        heat = cv2.blur(small, (reach, reach), borderType=cv2.BORDER_CONSTANT)
+        places: list[Array] = []
+        for _ in range(SEARCH_PLACES):
+            _, top, _, (x, y) = cv2.minMaxLoc(heat)
+            if top <= 0:
+                break
+            places.append(np.asarray(np.linalg.solve(camera, np.array([x, y, 1.0])) * depth_m, float))
+            cv2.circle(heat, (x, y), reach, -1e3, -1)
+        views = self.texture.views
+        picked = np.unique(np.linspace(0, len(views) - 1, SEARCH_TURNS).round().astype(int)) if views else []
+        turns = [self._pose[:3, :3], *(views[k].T_camera_object[:3, :3] for k in picked)]
+        scored: list[tuple[float, int, Array]] = []
+        for place in places:
+            for R in turns:
+                T = make_pose(R, place)
+                window = render_depth(self.mesh.vertices_m, self.mesh.faces, T, camera)
+                if window is not None:
+                    silhouette = window.mask_in_image(small.shape[1], small.shape[0])
+                    scored.append((float(small[silhouette].sum()), len(scored), T))
+        return [T for _, _, T in sorted(scored, reverse=True)[:SEARCH_PLACES]]
+
+    def _around(self, rgb: Image, T: Array) -> _Part:
+        """What lies around the object at a pose; the whole frame when it would be out of it."""
+        height, width = rgb.shape[:2]
+        points = transform_points(T, self.mesh.centres_m)
+        if points[:, 2].min() > 1e-3:
+            pixels = project(self.camera_matrix, points)
+            low, high = pixels.min(axis=0), pixels.max(axis=0)
+            pad = LOOK_AROUND * float((high - low).max()) + LOOK_AROUND_PX
+            x_a, y_a = np.clip(np.floor(low - pad), 0, [width, height]).astype(int)
+            x_b, y_b = np.clip(np.ceil(high + pad), 0, [width, height]).astype(int)
+            if min(x_b - x_a, y_b - y_a) >= LOOK_AROUND_PX:
+                return self._part(rgb, x_a, y_a, x_b, y_b)
+        return self._part(rgb, 0, 0, width, height)
+
+    def _part(self, rgb: Image, x_a: int, y_a: int, x_b: int, y_b: int) -> _Part:
+        image = np.ascontiguousarray(rgb[y_a:y_b, x_a:x_b])
+        camera = self.camera_matrix.copy()
+        camera[:2, 2] -= (x_a, y_a)
+        return _Part(colour_bins(image), edge_strength(image), flattened(image), camera)
+
+    def _share_in_view(self, T: Array) -> float:
+        """Share of the mesh's centres that project into the image."""
+        points = transform_points(T, self.mesh.centres_m)
         if points[:, 2].min() < 1e-3:
             return 0.0
         x, y = project(self.camera_matrix, points).T
+        width, height = self._size_px
         return float(np.mean((x >= 0) & (x < width) & (y >= 0) & (y < height)))

@@ -1,0 +1,188 @@
+"""Textured points: what the object showed in a few key views, drawn anew at the predicted pose and matched there.
+
+A key view is a frame whose pose is known well. Its picture is carried over the mesh to the pose that is predicted, so
+that little motion is left for pyramidal Lucas-Kanade flow whatever the turn since, and every match ties a pixel of the
+new frame to a point of the mesh as the key view has it: nothing is chained from frame to frame. Flow forth and back
+must agree, and RANSAC over poses must agree with the rest.
+
+A mirror-bright object shows its surroundings, which move otherwise than it does. `trust` learns from every frame
+whether the matches are rigid and whether they contradict the outline; what is not trusted is measured but not used.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from .geometry import Array, angle_between_rad, invert_pose, make_pose
+from .raster import DepthWindow, render_depth
+from .region import Points, TrackingMesh
+from .region_kernels import draw_view, solve_pose
+from .video import Image
+
+FLATTEN_PX = 8.0  # shading and exposure, wider than this, are taken out of the pictures
+CORNERS = 70  # a view
+ERODE_PX, PATCH_PX = 3, 15
+FORTH_AND_BACK_PX = 0.7
+ALIKE = 0.5  # mean difference of two patches, in their mean contrast
+RANSAC_PX, RANSAC_ROUNDS = 2.5, 40
+POINT_STD_PX = 0.5
+ENOUGH = 12  # inliers that say something
+VIEWS_APART_RAD = np.deg2rad(12)
+VIEWS_REACH_RAD = np.deg2rad(35)
+MOST_VIEWS = 48
+FIRST_TRUST, TRUST_RATE = 0.4, 0.15
+RIGID_SHARE = (0.45, 0.85)  # of the matches that RANSAC keeps: not trusted below, fully above
+STRAIN = (0.05, 0.4)  # squared standard deviations a line that the points cost the outline: trusted below, not above
+
+
+@dataclass(frozen=True)
+class KeyView:
+    """A frame that others are matched to: flattened grey picture, its camera, the pose and the mesh's depth there."""
+
+    picture: NDArray[np.uint8]
+    camera_matrix: Array
+    T_camera_object: Array
+    depth: DepthWindow
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Points found in a frame that agree with one pose, the share of all matches that did, and that pose."""
+
+    points: Points
+    rigid_share: float
+    T_camera_object: Array | None
+
+    def __len__(self) -> int:
+        return len(self.points.weight)
+
+
+NO_MATCHES = Matches(Points.none(), 0.0, None)
+
+
+class Texture:
+    """The key views of one object and how far its texture is trusted, in [0, 1]."""
+
+    def __init__(self, mesh: TrackingMesh):
+        self.mesh, self.trust = mesh, FIRST_TRUST
+        self.views: list[KeyView] = []
+
+    def match(self, picture: NDArray[np.uint8], camera_matrix: Array, T_predicted: Array) -> Matches:
+        """Match a flattened picture against the nearest key view and the oldest near enough."""
+        views = self._views_for(T_predicted)
+        depth = render_depth(self.mesh.vertices_m, self.mesh.faces, T_predicted, camera_matrix) if views else None
+        if depth is None:
+            return NO_MATCHES
+        found = [_matched(view, picture, camera_matrix, T_predicted, depth) for view in views]
+        object_m = np.concatenate([points for points, _ in found])
+        pixel = np.concatenate([pixels for _, pixels in found])
+        if len(pixel) < ENOUGH:
+            return NO_MATCHES
+        cv2.setRNGSeed(0)  # RANSAC draws from OpenCV's global generator
+        try:
+            good, _, _, kept = cv2.solvePnPRansac(
+                object_m, pixel, camera_matrix, None, iterationsCount=RANSAC_ROUNDS, reprojectionError=RANSAC_PX,
+                flags=cv2.SOLVEPNP_AP3P,
+            )  # fmt: skip
+        except cv2.error:
+            return NO_MATCHES
+        if not good or kept is None or len(kept) < ENOUGH:
+            return replace(NO_MATCHES, rigid_share=0.0 if kept is None else len(kept) / len(pixel))
+        kept = kept[:, 0]
+        points = Points(object_m[kept], pixel[kept], np.full(len(kept), (self.trust / POINT_STD_PX) ** 2))
+        return Matches(points, len(kept) / len(pixel), _pose_from(points, camera_matrix, T_predicted))
+
+    def judge(self, matches: Matches, strain: float) -> None:
+        """Learn from a frame: were there matches, did they move like one rigid body, did the outline object?"""
+        if matches.rigid_share == 0.0:
+            return
+        rigid = np.interp(matches.rigid_share, RIGID_SHARE, (0.0, 1.0))
+        calm = np.interp(strain, STRAIN, (1.0, 0.0))
+        self.trust += TRUST_RATE * float(rigid * calm - self.trust)
+
+    def keep(self, picture: NDArray[np.uint8], camera_matrix: Array, T_camera_object: Array) -> None:
+        """Make a frame a key view if no other shows the object from nearly the same side."""
+        if len(self.views) >= MOST_VIEWS:
+            return
+        towards = _towards(T_camera_object)
+        if any(angle_between_rad(towards, _towards(v.T_camera_object)) < VIEWS_APART_RAD for v in self.views):
+            return
+        depth = render_depth(self.mesh.vertices_m, self.mesh.faces, T_camera_object, camera_matrix)
+        if depth is not None:
+            self.views.append(KeyView(picture, camera_matrix, T_camera_object, depth))
+
+    def _views_for(self, T: Array) -> list[KeyView]:
+        angles = [float(angle_between_rad(_towards(T), _towards(v.T_camera_object))) for v in self.views]
+        near = [k for k, angle in enumerate(angles) if angle < VIEWS_REACH_RAD]
+        if not near:
+            return []
+        nearest = min(near, key=lambda k: angles[k])
+        return [self.views[k] for k in sorted({near[0], nearest})]
+
+
+def flattened(rgb: Image) -> NDArray[np.uint8]:
+    """(H, W) grey picture without slow shading."""
+    grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+    return np.asarray(cv2.addWeighted(grey, 1.0, cv2.blur(grey, (int(2 * FLATTEN_PX) + 1,) * 2), -1.0, 128.0))
+
+
+def _matched(
+    view: KeyView, picture: NDArray[np.uint8], camera_matrix: Array, T: Array, depth: DepthWindow
+) -> tuple[Array, Array]:
+    """Points of the mesh (N, 3) and their pixels (N, 2) in the picture, found with one key view."""
+    drawn, covered = np.full(picture.shape, 128, np.uint8), np.zeros(picture.shape, np.uint8)
+    draw_view(
+        depth.depth_m, depth.x0_px, depth.y0_px, camera_matrix, view.T_camera_object @ invert_pose(T),
+        view.depth.depth_m, view.depth.x0_px, view.depth.y0_px, view.picture, view.camera_matrix, drawn, covered,
+    )  # fmt: skip
+    inner = cv2.erode(covered, np.ones((2 * ERODE_PX + 1,) * 2, np.uint8))
+    corners: NDArray[Any] | None = cv2.goodFeaturesToTrack(drawn, CORNERS, 0.02, 4, mask=inner, blockSize=5)
+    if corners is None:
+        return np.zeros((0, 3)), np.zeros((0, 2))
+    there, ok, unlike = _flow(drawn, picture, corners)
+    back, ok_back, _ = _flow(picture, drawn, there)
+    near = np.linalg.norm(back - corners, axis=2)[:, 0] < FORTH_AND_BACK_PX
+    # Sensor noise has corners as well, and flow that stays where it is: only patches that look alike are matches.
+    x, y = np.round(corners[:, 0]).astype(int).T
+    contrast = cv2.blur(np.abs(drawn.astype(np.float32) - 128), (PATCH_PX, PATCH_PX))[y, x]
+    good = near & (ok[:, 0] > 0) & (ok_back[:, 0] > 0) & (unlike[:, 0] < ALIKE * contrast)
+    corners, there, x, y = corners[good, 0].astype(float), there[good, 0].astype(float), x[good], y[good]
+    z = depth.depth_m[y - depth.y0_px, x - depth.x0_px].astype(float)
+    rays = np.column_stack([(corners - camera_matrix[:2, 2]) / np.diag(camera_matrix)[:2], np.ones(len(z))])
+    return (rays * z[:, None] - T[:3, 3]) @ T[:3, :3], there
+
+
+def _flow(
+    one: NDArray[np.uint8], other: NDArray[np.uint8], corners: NDArray[Any]
+) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """Where corners (N, 1, 2) of one picture are in the other, (N, 1) whether found, and mean difference there."""
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 12, 0.03)
+    start = corners.copy()
+    return cv2.calcOpticalFlowPyrLK(
+        one, other, corners, start, winSize=(PATCH_PX, PATCH_PX), maxLevel=2, criteria=criteria,
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+    )  # fmt: skip
+
+
+def _pose_from(points: Points, camera_matrix: Array, T_near: Array) -> Array:
+    """The pose that fits the points, held to one nearby in what they do not say."""
+    turn, shift, information = T_near[:3, :3].copy(), T_near[:3, 3].copy(), np.zeros((6, 6))
+    distance = float(np.linalg.norm(shift))
+    prior = np.diag([1 / 0.3**2] * 3 + [1 / (0.05 * distance) ** 2] * 3)
+    no_line, none = np.zeros((0, 3)), np.zeros((0, 2))
+    solve_pose(
+        no_line, none, none, np.zeros(0), 1.0, points.object_m, points.pixel, np.ones(len(points.weight)),
+        10 * RANSAC_PX + 40.0, camera_matrix, T_near, prior, 6, turn, shift, information,
+    )  # fmt: skip
+    return make_pose(turn, shift)
+
+
+def _towards(T: Array) -> Array:
+    """Unit direction (3,) from the camera to the object's origin, in the object's frame: the side that is seen."""
+    direction = T[:3, :3].T @ T[:3, 3]
+    return np.asarray(direction / np.linalg.norm(direction))
