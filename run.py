@@ -142,6 +142,11 @@ def _track_figures(track: Any) -> dict[str, Any]:
         "place": f"{how['choice']}, box {' '.join(f'{v:g}' for v in how['box_xywh_px'])} in frame {how['start_frame']}",
         "symmetry": symmetry_in_words(mesh["symmetry"]["order"]),
     }
+    if cuts := track.header["video"].get("cuts"):
+        times = ", ".join(f"{cut['time_s']:.2f} s" for cut in cuts)
+        figures["cuts"] = f"the video jumps to another shot at {times}"
+    if (camera := track.header["camera"]["motion"]["kind"]) != "static":
+        figures["camera"] = camera
     faces = mesh.get("faces", {})
     if faces and faces["tracked"] < faces["in_file"]:
         figures["decimated"] = f"{faces['in_file']} faces in the file, {faces['tracked']} tracked"

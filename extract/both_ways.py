@@ -7,13 +7,17 @@ over the whole clip (follow.py) and reads the clip in the same order.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
+from .camera_motion import CameraWatch
+from .cuts import CutWatch
 from .follow import Followed
-from .geometry import Array
+from .geometry import Array, project, transform_points
 from .progress import Progress
+from .segment import Box
 from .starting import WORKING_SIDE_PX, Start, resized
 from .video import Image, VideoInfo, iterate_backward, iterate_frames
 
@@ -29,6 +33,15 @@ class Clip:
     start_index: int
     rgb: Image
     camera_matrix: Array
+
+
+@dataclass
+class Watched:
+    """What was seen beside the objects: times of the frames by index in s, cuts, and the camera's motion, if asked."""
+
+    times: dict[int, float] = field(default_factory=dict)
+    cuts: CutWatch = field(default_factory=CutWatch)
+    camera: CameraWatch | None = None
 
 
 def settle_rivals(clip: Clip, starts: Sequence[Start]) -> list[Start]:
@@ -50,32 +63,34 @@ def settle_rivals(clip: Clip, starts: Sequence[Start]) -> list[Start]:
     return [start.preferring(_surest(trial)) for start, trial in zip(starts, trials, strict=True)]
 
 
-def follow_both_ways(clip: Clip, starts: Sequence[Start], progress: Progress) -> tuple[list[Followed], Array]:
-    """Every object through the whole clip, twice; and the times of the frames (N,) in s.
+def follow_both_ways(
+    clip: Clip, starts: Sequence[Start], progress: Progress, *, watch_camera: bool = False
+) -> tuple[list[Followed], Watched]:
+    """Every object through the whole clip, twice; and what was seen beside them.
 
     Estimates of the result are by frame of the clip.
     """
-    times: dict[int, float] = {}
-    chained = _pass(clip, [lambda s=start: _begun(clip, s) for start in starts], times, progress, "following", True)
+    watched = Watched(camera=CameraWatch(clip.camera_matrix) if watch_camera else None)
+    chained = _pass(clip, [lambda s=start: _begun(clip, s) for start in starts], watched, progress, "following", True)
     progress(0, clip.info.frame_count, "fitting shapes to the whole clip")
     settled = [followed.second_pass(clip.rgb) for followed in chained]
 
-    def again(known: Followed) -> Followed:
-        assert known.guesses is not None
-        T = known.guesses[clip.start_index]
-        return Followed.start(
-            known.mesh, known.vessel, clip.camera_matrix, clip.rgb, known.first_mask, T, known.guesses
-        )
-
     words = "following again, with the whole clip in mind"
-    done = _pass(clip, [lambda k=known: again(k) for known in settled], times, progress, words, False)
-    return done, np.array([times[k] for k in sorted(times)])
+    done = _pass(
+        clip,
+        [lambda k=known: k.again(clip.rgb, clip.start_index) for known in settled],
+        watched,
+        progress,
+        words,
+        False,
+    )
+    return done, watched
 
 
 def _pass(
     clip: Clip,
     begin: Sequence[Callable[[], Followed]],
-    times: dict[int, float],
+    watched: Watched,
     progress: Progress,
     words: str,
     chained: bool,
@@ -87,7 +102,11 @@ def _pass(
     start, count = clip.start_index, clip.info.frame_count
     forward = [make() for make in begin]
     for frame in iterate_frames(clip.info.path, WORKING_SIDE_PX, clip.info):
-        times[frame.index] = frame.time_s
+        if chained:
+            watched.times[frame.index] = frame.time_s
+            watched.cuts.step(frame.rgb, frame.time_s)
+        elif watched.camera is not None:
+            watched.camera.step(frame.rgb, boxes=[b for f in forward if (b := _box(f, frame.index)) is not None])
         if frame.index >= start:
             for follower in forward:
                 follower.step(frame.rgb, frame.index - (start if chained else 0), count)
@@ -95,12 +114,24 @@ def _pass(
     if start == 0:
         return forward
     backward = [make() for make in begin]
-    before = [times[k] for k in range(start + 1)]
+    before = [watched.times[k] for k in range(start + 1)]
     for frame in iterate_backward(clip.info.path, before, WORKING_SIDE_PX):
         for follower in backward:
             follower.step(frame.rgb, start - frame.index if chained else frame.index, count)
         progress(count - frame.index, count, words)
     return [_joined(b, f, start) for b, f in zip(backward, forward, strict=True)]
+
+
+def _box(known: Followed, index: int) -> Box | None:
+    """Box around an object where the first pass saw it in a frame."""
+    if known.guesses is None or index >= len(known.guesses):
+        return None
+    points = transform_points(known.guesses[index], known.mesh.vertices_m)
+    if points[:, 2].min() < 1e-3:
+        return None
+    pixels = project(known.camera_matrix, points)
+    (x, y), (w, h) = pixels.min(axis=0), np.ptp(pixels, axis=0)
+    return float(x), float(y), float(w), float(h)
 
 
 def _joined(backward: Followed, forward: Followed, start: int) -> Followed:

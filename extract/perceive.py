@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from .both_ways import Clip, follow_both_ways, settle_rivals
+from .camera_motion import CameraWatch
 from .candidates import Model, vessel_model
 from .candidates import ObjectRequest as ObjectRequest
 from .candidates import candidate_models as candidate_models
@@ -35,6 +36,7 @@ from .video import Image, VideoInfo, iterate_frames, read_video_info
 
 SMOOTHING_BANDWIDTH_S = 0.06
 TRUSTED_CONFIDENCE = 0.5  # mean over the clip, of an object that nobody pointed at
+SURE_OF_CAMERA = 0.5  # median share of the background that agrees on how the camera turned
 SEEN_SHARE = 0.1  # of the clip, least
 GOOD_IOU = 0.75  # of the first frame's silhouette, below which other frames are looked at as well
 OTHER_FRAMES = (15, 45, 120)  # looked at then
@@ -71,7 +73,9 @@ def extract(
     `rerun` is true.
     camera: fx, fy, cx, cy in px; the focal prior f = sqrt(w^2 + h^2) when None.  The first request is the handled
     object, the others are receptacles.  start_frame: what boxes and masks belong to; when None the first, or another
-    that shows the objects better where nobody pointed at them.  progress: called with (done, total, what).
+    that shows the objects better where nobody pointed at them.  camera_motion: "static" does not look whether the
+    camera moves; "moving" takes it to turn even where that explains only a part of what is seen.
+    progress: called with (done, total, what).
     Raises UserError for a bad video, box, mask, name or mesh, and when an object cannot be found.
     """
     report = progress or (lambda done, total, what: None)
@@ -95,7 +99,9 @@ def extract(
     index, sharp, starts = _find(scene, requests, models, start_frame)
     clip = Clip(info, index, _small(sharp, scene), scene.camera(scene.scale))
     starts = settle_rivals(clip, starts)
-    followed, time_s = follow_both_ways(clip, starts, report)
+    followed, watched = follow_both_ways(clip, starts, report, watch_camera=camera_motion != "static")
+    time_s = np.array([watched.times[k] for k in sorted(watched.times)])
+    R_first_camera, motion_words = _camera_turns(watched.camera, camera_motion)
 
     tracks: dict[str, ObjectTrack] = {}
     for request, start, result in zip(requests, starts, followed, strict=True):
@@ -105,9 +111,11 @@ def extract(
         raw = np.stack([e.T_camera_object for e in result.estimates])
         model = start.best.model if result.vessel is None else vessel_model(result.vessel)
         smooth = smooth_poses(raw, time_s, confidence * visible, SMOOTHING_BANDWIDTH_S)
-        header = _header(request, scene, start, model, index) | {"camera": {"source": camera_source}}
+        header = _header(request, scene, start, model, index)
+        header["camera"] = {"source": camera_source, "motion": motion_words}
+        header["video"]["cuts"] = [{"frame": c.index, "time_s": round(c.time_s, 4)} for c in watched.cuts.cuts]
         header["settings"]["seed"] = seed
-        tracks[request.name] = ObjectTrack(smooth, time_s, camera_matrix, confidence, visible, header)
+        tracks[request.name] = ObjectTrack(smooth, time_s, camera_matrix, confidence, visible, header, R_first_camera)
 
     out.mkdir(parents=True, exist_ok=True)
     items = [OverlayItem(track, f.mesh) for track, f in zip(tracks.values(), followed, strict=True)]
@@ -122,6 +130,20 @@ def extract(
     if rerun:
         write_rerun(info.path, items, out / "extract.rrd")
     return tracks
+
+
+def _camera_turns(watch: CameraWatch | None, asked: str) -> tuple[Array | None, dict[str, Any]]:
+    """Orientation of each frame's camera in the first one's, None for a still camera; and that for the header."""
+    if watch is None:
+        return None, {"asked": asked, "kind": "static"}
+    motion = watch.result()
+    quality = round(float(np.median(motion.quality)), 3)
+    told = {"asked": asked, "stray_px": round(motion.stray_px, 2), "quality": quality}
+    # A rotation is a poor account of a camera that moves sideways, but better than none for one said to move.
+    turns = (motion.rotates_only and quality > SURE_OF_CAMERA) if asked == "auto" else not motion.static
+    if turns:
+        return motion.R_first_camera, {**told, "kind": "turning"}
+    return None, {**told, "kind": "static" if motion.static else "moving, not compensated"}
 
 
 def _find(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import zipfile
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,8 @@ class ObjectTrack:
     visible: (N,) bool, False where the object is out of view or lost.
     header: JSON-like; `object`, `mesh` (name, sha256, extents_m, symmetry, up_axis, and for library vessels
         `library` = {category, params}), `image_size_px` [w, h], `video`, `camera`, `settings`.
+    R_first_camera: (N, 3, 3) orientation of each frame's camera in the first frame's, of a camera that turns in
+        place; None for one that stands still.
     """
 
     T_camera_object: Array
@@ -38,6 +40,7 @@ class ObjectTrack:
     confidence: Array
     visible: np.ndarray[Any, np.dtype[np.bool_]]
     header: Mapping[str, Any] = field(default_factory=dict)
+    R_first_camera: Array | None = None
 
     def __post_init__(self) -> None:
         n = len(self.time_s)
@@ -48,6 +51,8 @@ class ObjectTrack:
             "confidence": (n,),
             "visible": (n,),
         }
+        if self.R_first_camera is not None:
+            expected["R_first_camera"] = (n, 3, 3)
         for name, shape in expected.items():
             value = np.asarray(getattr(self, name))
             if value.shape != shape:
@@ -71,6 +76,14 @@ class ObjectTrack:
         mesh = self.header.get("mesh", {})
         return Symmetry.from_json(mesh["symmetry"]) if "symmetry" in mesh else Symmetry()
 
+    def from_first_camera(self) -> ObjectTrack:
+        """The same motion as the camera of the first frame would have seen it, had it stood still."""
+        if self.R_first_camera is None:
+            return self
+        T = np.array(self.T_camera_object, float)
+        T[:, :3] = self.R_first_camera @ T[:, :3]
+        return replace(self, T_camera_object=T, R_first_camera=None)
+
     def save(self, path: Path) -> None:
         """Write `*.track.npz` atomically."""
         header = {
@@ -80,6 +93,7 @@ class ObjectTrack:
             "frames": {"camera": "OpenCV: x right, y down, z forward", "pose": "T_camera_object: object in camera"},
             **self.header,
         }
+        turns = {} if self.R_first_camera is None else {"R_first_camera": np.asarray(self.R_first_camera, np.float64)}
         with atomic_path(Path(path)) as temporary, open(temporary, "wb") as stream:
             np.savez_compressed(
                 stream,
@@ -89,6 +103,7 @@ class ObjectTrack:
                 confidence=np.asarray(self.confidence, np.float64),
                 visible=np.asarray(self.visible, bool),
                 header=np.array(json.dumps(header, allow_nan=False)),
+                **turns,
             )
 
     @staticmethod
@@ -99,7 +114,8 @@ class ObjectTrack:
         if missing := [name for name in names if name not in arrays]:
             raise UserError(f"{path} lacks {', '.join(missing)}; write it again with `vid2demo extract`")
         try:
-            return ObjectTrack(**{name: arrays[name] for name in names}, header=header)
+            turns = arrays.get("R_first_camera")
+            return ObjectTrack(**{name: arrays[name] for name in names}, header=header, R_first_camera=turns)
         except ValueError as error:
             raise UserError(f"{path} is not a valid track: {error}") from error
 
