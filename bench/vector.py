@@ -36,7 +36,7 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
     "PandaPour, 100 particles, fast": ("PandaPour-v0", {"num_particles": 100, "liquid": {"solver": "fast"}}),
 }
 # Steps that waited longer than this share of their time do not count.
-WAITED = 0.2
+WAITED = 0.4
 
 
 def waited_s() -> float:
