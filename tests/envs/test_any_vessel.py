@@ -69,7 +69,17 @@ def test_what_is_awkward_to_hold_or_aim_pours_too(category: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [f"{category}{seed}" for category in CATEGORIES for seed in ("", ":1", ":2")])
+@pytest.mark.parametrize(
+    "name",
+    [
+        *CATEGORIES,
+        *(
+            pytest.param(f"{category}:{seed}", marks=pytest.mark.exhaustive)
+            for category in CATEGORIES
+            for seed in (1, 2)
+        ),
+    ],
+)
 def test_the_built_in_pour_empties_every_vessel_of_the_library(name: str) -> None:
     from vid2demo.extract.any_vessel import resolve_vessel
 

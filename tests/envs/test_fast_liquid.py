@@ -330,7 +330,7 @@ def test_shaking_and_turning_over_leaks_nothing(category: str, count: int, shake
     assert over == 0 if category == "gooseneck_kettle" else over > 0.8 * count
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("count", [50, 100, 300])
 @pytest.mark.parametrize("category", CATEGORIES)
 def test_no_category_leaks(category: str, count: int, shaken: Callable[[int], Array]) -> None:

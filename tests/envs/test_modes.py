@@ -55,7 +55,7 @@ def test_two_environments_with_one_seed_agree_for_200_steps(mug_pour: Reference,
     agree(*made, steps=200)
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(
     ("control_mode", "obs_mode", "reward_mode", "start"),
     list(itertools.product(CONTROL_MODES, ("state", "pixels", "both"), REWARD_MODES, ("beginning", "reference"))),

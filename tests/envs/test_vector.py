@@ -119,7 +119,7 @@ def test_a_spout_that_moves_particles_keeps_its_bits(kettle_pour: Reference, sol
     assert vector.envs[0].simulation.scene.vessel.outlet.kind == "spout"
 
 
-@pytest.mark.slow
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("control_mode", CONTROL_MODES)
 @pytest.mark.parametrize("obs_mode", ["state", "pixels", "both"])
 @pytest.mark.parametrize("reward_mode", list(REWARD_MODES))
