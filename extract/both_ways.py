@@ -71,14 +71,14 @@ def follow_both_ways(
     Estimates of the result are by frame of the clip.
     """
     watched = Watched(camera=CameraWatch(clip.camera_matrix) if watch_camera else None)
-    chained = _pass(clip, [lambda s=start: _begun(clip, s) for start in starts], watched, progress, "following", True)
+    chained = _pass(clip, [partial(_begun, clip, start) for start in starts], watched, progress, "following", True)
     progress(0, clip.info.frame_count, "fitting shapes to the whole clip")
     settled = [followed.second_pass(clip.rgb) for followed in chained]
 
     words = "following again, with the whole clip in mind"
     done = _pass(
         clip,
-        [lambda k=known: k.again(clip.rgb, clip.start_index) for known in settled],
+        [partial(known.again, clip.rgb, clip.start_index) for known in settled],
         watched,
         progress,
         words,
@@ -145,7 +145,8 @@ def _joined(backward: Followed, forward: Followed, start: int) -> Followed:
 def _begun(clip: Clip, start: Start, hypothesis: int = 0) -> Followed:
     chosen = start.hypotheses[hypothesis]
     mask, T = resized(chosen.mask, clip.rgb), chosen.pose.T_camera_object
-    return Followed.start(chosen.model.mesh, chosen.model.vessel, clip.camera_matrix, clip.rgb, mask, T)
+    model = chosen.model
+    return Followed.start(model.mesh, model.vessel, clip.camera_matrix, clip.rgb, mask, T, symmetry=model.symmetry)
 
 
 def _surest(trial: Sequence[Followed]) -> int:

@@ -114,7 +114,7 @@ def extract(
         header = _header(request, scene, start, model, index)
         header["camera"] = {"source": camera_source, "motion": motion_words}
         header["video"]["cuts"] = [{"frame": c.index, "time_s": round(c.time_s, 4)} for c in watched.cuts.cuts]
-        header["settings"]["seed"] = seed
+        header["settings"] |= {"spin_source": result.spin_source, "seed": seed}
         tracks[request.name] = ObjectTrack(smooth, time_s, camera_matrix, confidence, visible, header, R_first_camera)
 
     out.mkdir(parents=True, exist_ok=True)
