@@ -29,7 +29,7 @@ from .video import Image
 GLIMPSES = 60  # frames kept for the spin
 FIT_VIEWS = 6  # frames that the shape is fitted to
 SECOND_LOOK_RAD = np.deg2rad(60)  # most that a second look at the spin may change: it mends, it does not turn round
-SURE = 0.35  # least confidence of a frame that the shape may be fitted to
+SURE = 0.5  # least confidence of a frame that the shape may be fitted to
 
 
 @dataclass(frozen=True)

@@ -264,7 +264,7 @@ def solve_pose(
         twist[3:] = t - T_start[:3, 3]
         delta = np.linalg.solve(information + prior, gradient - prior @ twist)
         step = delta[:3]
-        R[:] = np.dot(_exp(step), R)
+        R[:] = np.dot(_exp(step[0], step[1], step[2]), R)
         t += delta[3:]
         if np.abs(delta).max() < 1e-6:
             break
@@ -272,10 +272,10 @@ def solve_pose(
 
 
 @numba.njit(cache=True)
-def _exp(turn: Array) -> Array:
-    """Rotation (3, 3) by a rotation vector (3,)."""
-    angle = np.sqrt(np.sum(turn * turn))
-    K = np.array([[0.0, -turn[2], turn[1]], [turn[2], 0.0, -turn[0]], [-turn[1], turn[0], 0.0]])
+def _exp(x: float, y: float, z: float) -> Array:
+    """Rotation (3, 3) by a rotation vector."""
+    angle = np.sqrt(x * x + y * y + z * z)
+    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     if angle < 1e-8:
         small: Array = np.eye(3) + K
         return small

@@ -36,6 +36,7 @@ VIEWS_APART_RAD = np.deg2rad(12)
 VIEWS_REACH_RAD = np.deg2rad(35)
 MOST_VIEWS = 48
 FIRST_TRUST, TRUST_RATE = 0.4, 0.15
+MANY, BEYOND_DOUBT = 30, (0.85, 0.95)
 RIGID_SHARE = (0.45, 0.85)  # of the matches that RANSAC keeps: not trusted below, fully above
 STRAIN = (0.05, 0.4)  # squared standard deviations a line that the points cost the outline: trusted below, not above
 
@@ -103,6 +104,9 @@ class Texture:
             return
         rigid = np.interp(matches.rigid_share, RIGID_SHARE, (0.0, 1.0))
         calm = np.interp(strain, STRAIN, (1.0, 0.0))
+        if len(matches) >= MANY:
+            # So many points that move as one are no reflections: it is the outline that is hidden, or the mesh rough.
+            calm = max(calm, np.interp(matches.rigid_share, BEYOND_DOUBT, (0.0, 1.0)))
         self.trust += TRUST_RATE * float(rigid * calm - self.trust)
 
     def keep(self, picture: NDArray[np.uint8], camera_matrix: Array, T_camera_object: Array) -> None:

@@ -17,6 +17,7 @@ from .geometry import Array, Symmetry
 
 SCHEMA = "vid2demo/object-track"
 SCHEMA_VERSION = 1
+OPTIONAL = ("R_first_camera", "T_camera_object_raw")  # arrays that a file may lack
 
 
 @dataclass(frozen=True)
@@ -32,6 +33,7 @@ class ObjectTrack:
         `library` = {category, params}), `image_size_px` [w, h], `video`, `camera`, `settings`.
     R_first_camera: (N, 3, 3) orientation of each frame's camera in the first frame's, of a camera that turns in
         place; None for one that stands still.
+    T_camera_object_raw: (N, 4, 4) the poses before smoothing; None where they were not smoothed.
     """
 
     T_camera_object: Array
@@ -41,6 +43,7 @@ class ObjectTrack:
     visible: np.ndarray[Any, np.dtype[np.bool_]]
     header: Mapping[str, Any] = field(default_factory=dict)
     R_first_camera: Array | None = None
+    T_camera_object_raw: Array | None = None
 
     def __post_init__(self) -> None:
         n = len(self.time_s)
@@ -53,6 +56,8 @@ class ObjectTrack:
         }
         if self.R_first_camera is not None:
             expected["R_first_camera"] = (n, 3, 3)
+        if self.T_camera_object_raw is not None:
+            expected["T_camera_object_raw"] = (n, 4, 4)
         for name, shape in expected.items():
             value = np.asarray(getattr(self, name))
             if value.shape != shape:
@@ -80,9 +85,14 @@ class ObjectTrack:
         """The same motion as the camera of the first frame would have seen it, had it stood still."""
         if self.R_first_camera is None:
             return self
-        T = np.array(self.T_camera_object, float)
-        T[:, :3] = self.R_first_camera @ T[:, :3]
-        return replace(self, T_camera_object=T, R_first_camera=None)
+        turned = []
+        for poses in (self.T_camera_object, self.T_camera_object_raw):
+            T = None if poses is None else np.array(poses, float)
+            if T is not None:
+                T[:, :3] = self.R_first_camera @ T[:, :3]
+            turned.append(T)
+        assert turned[0] is not None
+        return replace(self, T_camera_object=turned[0], T_camera_object_raw=turned[1], R_first_camera=None)
 
     def save(self, path: Path) -> None:
         """Write `*.track.npz` atomically."""
@@ -93,7 +103,8 @@ class ObjectTrack:
             "frames": {"camera": "OpenCV: x right, y down, z forward", "pose": "T_camera_object: object in camera"},
             **self.header,
         }
-        turns = {} if self.R_first_camera is None else {"R_first_camera": np.asarray(self.R_first_camera, np.float64)}
+        optional = {name: getattr(self, name) for name in OPTIONAL}
+        extra: dict[str, Any] = {k: np.asarray(v, np.float64) for k, v in optional.items() if v is not None}
         with atomic_path(Path(path)) as temporary, open(temporary, "wb") as stream:
             np.savez_compressed(
                 stream,
@@ -103,7 +114,7 @@ class ObjectTrack:
                 confidence=np.asarray(self.confidence, np.float64),
                 visible=np.asarray(self.visible, bool),
                 header=np.array(json.dumps(header, allow_nan=False)),
-                **turns,
+                **extra,
             )
 
     @staticmethod
@@ -114,8 +125,8 @@ class ObjectTrack:
         if missing := [name for name in names if name not in arrays]:
             raise UserError(f"{path} lacks {', '.join(missing)}; write it again with `vid2demo extract`")
         try:
-            turns = arrays.get("R_first_camera")
-            return ObjectTrack(**{name: arrays[name] for name in names}, header=header, R_first_camera=turns)
+            optional = {name: arrays[name] for name in OPTIONAL if name in arrays}
+            return ObjectTrack(**{name: arrays[name] for name in names}, header=header, **optional)
         except ValueError as error:
             raise UserError(f"{path} is not a valid track: {error}") from error
 

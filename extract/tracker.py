@@ -23,16 +23,17 @@ from .spin import object_evidence
 from .texture import NO_MATCHES, Matches, Texture, flattened
 from .video import Image
 
+LOGISTIC = (5.26, 2.42, 2.27, -3.29)
 LEARNING_RATE = 0.15
-LEARN_ABOVE = 0.4  # a frame the tracker is unsure of teaches it nothing
-KEY_ABOVE = 0.6
-LOST_BELOW = 0.2
-FOUND_ABOVE = 0.4  # what was lost must be surer to be found than what is held must be to be kept
+LEARN_ABOVE = 0.5  # a frame the tracker is unsure of teaches it nothing
+KEY_ABOVE = 0.8
+LOST_BELOW = 0.25
+FOUND_ABOVE = 0.5  # what was lost must be surer to be found than what is held must be to be kept
 VELOCITY_KEPT = 0.7  # hands accelerate: half-trusting the last velocity beats trusting it or ignoring it
 COARSE_PX, FINE_PX, SEARCH_PX = (5.0, 3.0, 2.0, 1.0, 1.0), (2.0, 1.0, 1.0), (9.0, 7.0, 5.0, 3.0, 2.0, 1.0)
 TRUSTED = 0.5  # texture that may start a frame's refinement and tell the spin of a body of revolution
 SURE_MATCHES = 20
-STILL_SPIN_RAD, HELD_SPIN_RAD = 1e-3, 0.01  # what cannot be seen; what the whole clip has told
+STILL_SPIN_RAD, HELD_SPIN_RAD = 1e-3, 0.014  # what cannot be seen; what the whole clip has told
 TEXTURED_SHARE = 0.3
 LOOK_AROUND = 0.3  # of the object's size, and LOOK_AROUND_PX
 LOOK_AROUND_PX = 50
@@ -63,8 +64,14 @@ class Signs:
 
     @property
     def confidence(self) -> float:
-        """Probability that the pose is right."""
-        return 0.5 * self.agree + 0.5 * self.on_edges
+        """Probability that the pose is right: the mesh within 5 % of its size in the image, turned by under 12 degrees.
+
+        A logistic regression over 525 refinements of poses wrong by up to 15 degrees and 12 % of the distance, in
+        synthetic pours of a kettle, a mug and a bottle half hidden by its hand. What it said and how many were right:
+        0.14: none, 0.29: 21 %, 0.51: 74 %, 0.71: 65 %, 0.96: 97 %.
+        """
+        a, b, c, d = LOGISTIC
+        return float(1 / (1 + np.exp(-(a * self.agree + b * self.on_edges + c * self.rigid + d))))
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,134 @@
+"""Textured points tell what the outline cannot, and are not believed where they contradict it."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from vid2demo.extract.geometry import Symmetry, focal_prior_camera_matrix, make_pose, rotation_angle_rad
+from vid2demo.extract.raster import render_depth
+from vid2demo.extract.region import TrackingMesh
+from vid2demo.extract.texture import Matches, Texture, flattened
+from vid2demo.extract.tracker import ObjectTracker, Signs
+
+WIDTH, HEIGHT = 320, 240
+K = focal_prior_camera_matrix(WIDTH, HEIGHT)
+RADIUS_M, HALF_M = 0.045, 0.07
+
+
+@pytest.fixture(scope="module")
+def can() -> TrackingMesh:
+    """A cylinder about +z: its outline never tells how it is turned."""
+    turns = np.linspace(0, 2 * np.pi, 48, endpoint=False)
+    ring = np.stack([RADIUS_M * np.cos(turns), RADIUS_M * np.sin(turns)], axis=1)
+    rows = [np.column_stack([ring, np.full(48, z)]) for z in np.linspace(-HALF_M, HALF_M, 8)]
+    vertices = np.vstack([*rows, [[0, 0, -HALF_M], [0, 0, HALF_M]]])
+    faces = []
+    for row in range(7):
+        for k in range(48):
+            a, b = 48 * row + k, 48 * row + (k + 1) % 48
+            faces += [[a, b, a + 48], [b, b + 48, a + 48]]
+    for k in range(48):
+        faces += [[k, (k + 1) % 48, 384], [336 + k, 336 + (k + 1) % 48, 385]]
+    return TrackingMesh.build(vertices, np.array(faces, np.int32))
+
+
+def label(seed: int = 3) -> np.ndarray:
+    """A printed label, (height, circumference)."""
+    blotches = np.random.default_rng(seed).normal(0, 1, (60, 120))
+    return 60 * np.sign(cv2.GaussianBlur(np.tile(blotches, (1, 3)), (0, 0), 2.0)[:, 120:240])
+
+
+def picture(can: TrackingMesh, T: np.ndarray, seed: int, printed: np.ndarray | None) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    image = rng.normal((70, 110, 160), 4, (HEIGHT, WIDTH, 3))
+    window = render_depth(can.vertices_m, can.faces, T, K)
+    assert window is not None
+    j, i = np.nonzero(window.depth_m)
+    z, x, y = window.depth_m[j, i].astype(float), i + window.x0_px, j + window.y0_px
+    points = np.column_stack([(x - K[0, 2]) / K[0, 0] * z, (y - K[1, 2]) / K[1, 1] * z, z])
+    at = (points - T[:3, 3]) @ T[:3, :3]
+    colour = rng.normal((170, 110, 70), 4, (len(z), 3))
+    if printed is not None:
+        u = (np.arctan2(at[:, 1], at[:, 0]) / (2 * np.pi) * 120).astype(int) % 120
+        v = np.clip((at[:, 2] / (2 * HALF_M) + 0.5) * 60, 0, 59).astype(int)
+        colour += printed[v, u][:, None]
+    keep = (x >= 0) & (x < WIDTH) & (y >= 0) & (y < HEIGHT)
+    image[y[keep], x[keep]] = colour[keep]
+    return np.clip(image, 0, 255).astype(np.uint8)
+
+
+def pose(spin_deg: float, lean_deg: float = 0.0, x_m: float = 0.0) -> np.ndarray:
+    turn = Rotation.from_euler("z", lean_deg, degrees=True) * Rotation.from_euler("x", 110, degrees=True)
+    return make_pose((turn * Rotation.from_euler("z", spin_deg, degrees=True)).as_matrix(), (x_m, 0.01, 0.45))
+
+
+def tracker_at(can: TrackingMesh, T: np.ndarray, printed: np.ndarray | None) -> ObjectTracker:
+    window = render_depth(can.vertices_m, can.faces, T, K)
+    assert window is not None
+    mask = window.mask_in_image(WIDTH, HEIGHT)
+    return ObjectTracker(can, K, picture(can, T, 0, printed), mask, T, Symmetry(order=0))
+
+
+def test_matches_lie_where_the_mesh_s_points_went(can: TrackingMesh) -> None:
+    texture, printed = Texture(can), label()
+    texture.keep(flattened(picture(can, pose(0), 0, printed)), K, pose(0))
+    T = pose(6.0, 4.0, 0.006)
+    found = texture.match(flattened(picture(can, T, 1, printed)), K, pose(3.0, 1.0, 0.002))
+    assert len(found) > 25
+    assert found.rigid_share > 0.7
+    assert np.median(found.points.errors_px(T, K)) < 0.7
+    assert found.T_camera_object is not None
+    assert np.rad2deg(rotation_angle_rad(found.T_camera_object[:3, :3], T[:3, :3])) < 2
+
+
+def test_a_spin_that_only_the_label_shows_is_followed(can: TrackingMesh) -> None:
+    printed = label()
+    tracker = tracker_at(can, pose(0), printed)
+    for k in range(1, 31):
+        T = pose(2.0 * k, 0.3 * k, 0.0005 * k)
+        estimate = tracker.step(picture(can, T, k, printed))
+    assert np.rad2deg(rotation_angle_rad(estimate.T_camera_object[:3, :3], T[:3, :3])) < 5
+    assert tracker.spin_source(30) == "texture"
+
+
+def test_a_spin_that_nothing_shows_is_not_invented(can: TrackingMesh) -> None:
+    tracker = tracker_at(can, pose(0), None)
+    for k in range(1, 21):
+        estimate = tracker.step(picture(can, pose(0, 0.5 * k, 0.0005 * k), k, None))
+    turned, leant = estimate.T_camera_object[:3, :3], pose(0, 10.0)[:3, :3]
+    assert np.rad2deg(np.arccos(turned[:, 2] @ leant[:, 2])) < 3
+    # The shortest turn that takes the axis there, and no more.
+    assert np.rad2deg(rotation_angle_rad(turned, pose(0)[:3, :3])) < 11
+    assert tracker.spin_source(20) == "none"
+
+
+def test_sensor_noise_gives_no_matches(can: TrackingMesh) -> None:
+    texture = Texture(can)
+    texture.keep(flattened(picture(can, pose(0), 0, None)), K, pose(0))
+    assert len(texture.match(flattened(picture(can, pose(0), 1, None)), K, pose(0))) == 0
+
+
+def test_what_is_not_rigid_or_contradicts_the_outline_loses_trust(can: TrackingMesh) -> None:
+    texture = Texture(can)
+    texture.keep(flattened(picture(can, pose(0), 0, label())), K, pose(0))
+    found = texture.match(flattened(picture(can, pose(0), 1, label())), K, pose(0))
+    for _ in range(30):
+        texture.judge(found, 0.0)
+    trusted = texture.trust
+    for _ in range(30):
+        texture.judge(Matches(found.points, 0.4, None), 0.0)
+    assert trusted > 0.8
+    assert texture.trust < 0.1
+    for _ in range(30):
+        texture.judge(Matches(found.points, 0.8, None), 2.0)
+    assert texture.trust < 0.1
+
+
+def test_confidence_rises_with_every_sign_and_says_little_of_nothing() -> None:
+    base = Signs(0.5, 0.5, 0.2)
+    better = [Signs(0.8, 0.5, 0.2), Signs(0.5, 0.8, 0.2), Signs(0.5, 0.5, 0.6)]
+    assert all(s.confidence > base.confidence for s in better)
+    assert Signs(0.0, 0.1, 0.0).confidence < 0.1
+    assert Signs(0.95, 0.9, 0.9).confidence > 0.95
