@@ -114,7 +114,10 @@ def extract_stage(settings: RunSettings, folder: Path) -> Stage:
         )
         return {name: _track_figures(track) for name, track in tracks.items()}
 
-    told = {"objects": [asdict(o) | {"mesh": None, "mask": None} for o in objects], "camera": settings.camera}
+    told: dict[str, Any] = {
+        "objects": [asdict(o) | {"mesh": None, "mask": None} for o in objects],
+        "camera": settings.camera,
+    }
     told |= {"start_frame": settings.start_frame, "camera_motion": settings.camera_motion, "seed": settings.seed}
     files = {f"mesh of {o.name}": o.mesh for o in objects if o.mesh is not None}
     files |= {f"mask of {o.name}": o.mask for o in objects if o.mask is not None}

@@ -130,7 +130,7 @@ def start_object(
     ]
     fits.sort(key=lambda fit: fit[1].merit, reverse=True)
     kept = distinct([pose for _, pose, _ in fits], APART_DEG, HYPOTHESES, RIVAL_WITHIN, fits[0][0].symmetry)
-    found = []
+    found: list[Hypothesis] = []
     for model, pose, evidence in fits:
         if any(pose is k for k in kept):
             sharp = resized(evidence, rgb) if mask is None else mask

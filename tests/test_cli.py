@@ -249,3 +249,25 @@ def test_reader_that_goes_away_is_no_error() -> None:
 
 def test_user_error_is_a_value_error_for_library_callers() -> None:
     assert issubclass(UserError, ValueError)
+
+
+def test_compare_track_prints_and_writes_the_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from vid2demo.extract.geometry import focal_prior_camera_matrix
+    from vid2demo.extract.track import ObjectTrack
+
+    T = np.tile(np.eye(4), (5, 1, 1))
+    T[:, :3, 3] = np.linspace([0, 0, 0.5], [0.1, 0, 0.6], 5)
+    header = {"mesh": {"extents_m": [0.1, 0.1, 0.1]}, "image_size_px": [640, 480]}
+    camera, time_s = focal_prior_camera_matrix(640, 480), np.arange(5) / 25
+    ObjectTrack(T, time_s, camera, np.ones(5), np.ones(5, bool), header).save(tmp_path / "a.track.npz")
+    np.savez(tmp_path / "truth.npz", T_camera_object=T, camera_matrix=camera, time_s=time_s)
+    words = ["compare-track", str(tmp_path / "a.track.npz"), str(tmp_path / "truth.npz"), "--symmetry-order", "0"]
+    assert cli.main([*words, "--out", str(tmp_path / "figures.json")]) == 0
+    assert "aligned_rotation_deg" in capsys.readouterr().out
+    written = json.loads((tmp_path / "figures.json").read_text())
+    assert cli.main([*words, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == written
+    assert written["frames"] == 5
+    assert written["pose"]["translation_m"] == pytest.approx(0, abs=1e-9)
+    assert "negative" in refused(capsys, *words[:-1], "-1")
+    assert "gone.npz does not exist" in refused(capsys, *words[:2], tmp_path / "gone.npz")
