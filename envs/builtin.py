@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from ..extract.errors import UserError
 from ..extract.geometry import Array, invert_pose, make_pose
 from .collision import CollisionChecker
-from .grasps import MAX_WIDTH_M, grasp_candidates
+from .grasps import MAX_WIDTH_M, grasp_candidates, wide_grasps
 from .jet import filling_m3, jet_of
 from .kinematics import arm_seeds, limit_margin_rad, solve_ik
 from .placement_search import Placement, Stage, search_placement
@@ -106,6 +106,7 @@ def pour_reference(
     )
     T, time_s, T_receptacle = pour_motion(vessel, receptacle, plan, control_hz)
     movable = start_xy_m is None and receptacle_xy_m is None and heading_deg is None
+    notes = ["built-in motion, not from a video"]
     try:
         T_hand_object, q_start_rad = reachable_grasp(vessel, T)
         clear = not movable or _is_clear(vessel, T_hand_object, receptacle, T_receptacle, T, q_start_rad)
@@ -114,14 +115,15 @@ def pour_reference(
             raise
         clear = False
     if not clear:
-        found = search_placement(Stage(T, time_s, vessel, receptacle, T_receptacle), np.random.default_rng(0))
-        if not isinstance(found, Placement):
-            raise UserError(
-                f"the arm cannot carry the {vessel.category} along this pour: {100 * found.missing_m:.0f} cm are "
-                "missing; tilt less, or take a smaller vessel or receptacle"
-            )
+        found = _placed(Stage(T, time_s, vessel, receptacle, T_receptacle))
         T, T_receptacle = found.T_world_stage @ T, found.T_world_stage @ T_receptacle
         T_hand_object, q_start_rad = found.grasp.T_hand_object, found.q_rad[0]
+        if not found.grasp.fits_hand:
+            notes.append(
+                f"The vessel is {100 * found.grasp.width_m:.1f} cm wide where it is held, the fingers open to "
+                f"{100 * MAX_WIDTH_M:.1f} cm: it can be held in simulation only."
+            )
+        notes += [f"The {c.first} touches the {c.second} ({1000 * c.depth_m:.0f} mm deep)." for c in found.collisions]
     header = {
         "symmetry": vessel.symmetry.to_json(),
         "vessel": vessel_to_header(vessel),
@@ -129,9 +131,29 @@ def pour_reference(
         "T_hand_object": T_hand_object.tolist(),
         "q_start_rad": q_start_rad.tolist(),
         "scale": 1.0,
-        "notes": ["built-in motion, not from a video"],
+        "notes": notes,
     }
     return Reference.from_poses(T, time_s, header)
+
+
+def _placed(stage: Stage) -> Placement:
+    """Where the arm can do a pour and how it holds the vessel; by what is too wide for the fingers if it must be.
+
+    Raises UserError when it is out of reach everywhere.
+    """
+    found = search_placement(stage, np.random.default_rng(0))
+    if not isinstance(found, Placement) or found.collisions:
+        # Held by its rim, a vessel that is turned far over brings the hand down to the table.
+        wide = wide_grasps(stage.vessel)
+        other = search_placement(stage, np.random.default_rng(0), grasps=wide) if wide else found
+        if isinstance(other, Placement) and (not isinstance(found, Placement) or not other.collisions):
+            found = other
+    if isinstance(found, Placement):
+        return found
+    raise UserError(
+        f"the arm cannot carry the {stage.vessel.category} along this pour: {100 * found.missing_m:.0f} cm are "
+        "missing; tilt less, or take a smaller vessel or receptacle"
+    )
 
 
 def emptying_tilt_deg(vessel: Vessel, receptacle: Vessel) -> float:

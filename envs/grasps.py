@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..extract.geometry import Array, invert_pose, make_pose, transform_points
-from .panda import FINGER_MAX_M
+from .panda import FINGER_MAX_M, PAD_M
 from .receptacle import surface_points
 
 if TYPE_CHECKING:
@@ -54,9 +54,18 @@ def grasp_candidates(vessel: Vessel) -> list[Grasp]:
     Grasps whose palm or fingers would cut into the vessel are left out. What is wider than the fingers open is held by
     the wall at its rim; regions that are too wide are used only when it has no rim either.
     """
-    points = surface_points(vessel)
     regions = [region for region in vessel.grasps if region.width_m <= MAX_WIDTH_M]
-    regions = regions or rim_regions(vessel) or list(vessel.grasps)
+    return _clear(regions or rim_regions(vessel) or list(vessel.grasps), vessel)
+
+
+def wide_grasps(vessel: Vessel) -> list[Grasp]:
+    """Grasps around what is wider than the fingers open, which can be held in simulation only."""
+    return _clear([region for region in vessel.grasps if region.width_m > MAX_WIDTH_M], vessel)
+
+
+def _clear(regions: list[GraspRegion], vessel: Vessel) -> list[Grasp]:
+    """All grasps of some regions but those that cut into the vessel."""
+    points = surface_points(vessel)
     grasps = [grasp for region in regions for grasp in _of_region(region, vessel)]
     free = [grasp for grasp in grasps if not _cuts(grasp, points)]
     # A vessel that no hand can hold cleanly is still shown to the user, who reads of it in the notes.
@@ -71,7 +80,10 @@ def rim_regions(vessel: Vessel) -> list[GraspRegion]:
     if not vessel.is_open or vessel.wall_m > MAX_WIDTH_M:
         return []
     rings = profile.outlines(72)
-    top, deep = rings[-1], rings[int(np.argmin(np.abs(profile.z_m - (profile.z_m[-1] - RIM_GRASP_M))))]
+    z_m = float(profile.z_m[-1]) - RIM_GRASP_M
+    below = int(np.clip(np.searchsorted(profile.z_m, z_m) - 1, 0, len(rings) - 2))
+    share = (z_m - profile.z_m[below]) / (profile.z_m[below + 1] - profile.z_m[below])
+    top, deep = rings[-1], rings[below] + max(share, 0.0) * (rings[below + 1] - rings[below])
     middle = np.array([*profile.axis_xy_m, 0.0])
     regions = []
     for angle_rad in np.deg2rad([90.0, 135.0, 180.0, 225.0, 270.0]):
@@ -82,8 +94,11 @@ def rim_regions(vessel: Vessel) -> list[GraspRegion]:
         up = top[k] - deep[k]
         up -= (up @ tangent) * tangent
         up /= np.linalg.norm(up)
-        center = top[k] - RIM_GRASP_M / 2 * up + vessel.wall_m / 2 * np.cross(tangent, up)
-        regions.append(GraspRegion("body", center, tangent, 0.02, vessel.wall_m, -up))
+        # The inner finger is as wide as the pads and touches a curved wall with its edges.
+        radius_m = float(np.linalg.norm((top[k] - middle)[:2]))
+        bow_m = radius_m - float(np.sqrt(max(radius_m**2 - PAD_M[1][0] ** 2, 0.0)))
+        center = top[k] - RIM_GRASP_M / 2 * up + (vessel.wall_m - bow_m) / 2 * np.cross(tangent, up)
+        regions.append(GraspRegion("body", center, tangent, 0.008, vessel.wall_m + bow_m, -up))
     return regions
 
 

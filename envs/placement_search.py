@@ -96,12 +96,15 @@ class _Batch:
         return T
 
 
-def search_placement(stage: Stage, rng: np.random.Generator, *, thorough: bool = True) -> Placement | Shortfall:
+def search_placement(
+    stage: Stage, rng: np.random.Generator, *, thorough: bool = True, grasps: list[Grasp] | None = None
+) -> Placement | Shortfall:
     """The best place, yaw and grasp for a motion, or how far the nearest one misses.
 
     thorough: False stops at the first ranking (is it possible at all?), without refinement and collision checks.
+    grasps: to choose among; `grasp_candidates` of the vessel if None.
     """
-    grasps = grasp_candidates(stage.vessel)
+    grasps = grasp_candidates(stage.vessel) if grasps is None else grasps
     knots = _spread_knots(stage.T_object)
     T_object = stage.T_object[knots]
     pour = int(np.argmin(np.abs(knots - int(np.argmax(tilt_rad(stage.T_object))))))

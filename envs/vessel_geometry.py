@@ -34,6 +34,8 @@ OVERLAP_M, INTRUSION_M = 0.006, 0.0001
 # Strips shorter than a particle would only add edges for it to be squeezed between.
 MIN_STRIP_M = 0.01
 WIDE_RADIUS_M = 0.045
+# What a finger needs between two walls.
+FINGER_ROOM_M = 0.015
 # Share of edges between faces of different colours; parts of one colour each stay below 0.05, textures above 0.1.
 SPECKLED_SHARE = 0.07
 _IDENTITY = np.eye(4)
@@ -348,4 +350,9 @@ def gripper_half_width_m(vessel: Vessel, T_hand_object: Array, pad_m: float = 0.
     between = (
         (np.abs(in_hand[:, 0]) < pad_m) & (np.abs(in_hand[:, 2]) < pad_m) & (np.abs(in_hand[:, 1]) < 1.2 * limit_m)
     )
-    return float(min(np.abs(in_hand[between, 1]).max(), limit_m)) if np.any(between) else 0.0
+    if not np.any(between):
+        return 0.0
+    away = np.sort(np.abs(in_hand[between, 1]))
+    # Held by its wall at the rim, a vessel has its far side beyond a finger.
+    beyond = np.flatnonzero(np.diff(away) > FINGER_ROOM_M)
+    return float(min(away[beyond[0]] if len(beyond) else away[-1], limit_m))

@@ -28,13 +28,12 @@ MIN_DEPTH, MIN_DEPTH_M, MIN_MOUTH_M2, MIN_SHARE = 0.28, 0.01, 8e-5, 0.015
 
 @dataclass(frozen=True)
 class Pit:
-    """What rain would leave standing: volume, depth, area of the surface; `mask` (nx, ny) on the grid, its spill."""
+    """What rain would leave standing: volume, depth, area and height of its surface, middle of its deep part (2,)."""
 
     volume_m3: float
     depth_m: float
     area_m2: float
     spill_m: float
-    mask: NDArray[np.bool_]
     center_xy_m: Array
 
 
@@ -104,7 +103,7 @@ class Columns:
             deep = mask & (drop > 0.5 * depth)
             volume = float(drop[mask].sum()) * self.cell_m**2
             area = float(mask.sum()) * self.cell_m**2
-            found.append(Pit(volume, depth, area, float(level[mask].max()), mask, self.xy(deep).mean(axis=0)))
+            found.append(Pit(volume, depth, area, float(level[mask].max()), self.xy(deep).mean(axis=0)))
         return sorted(found, key=lambda pit: -pit.volume_m3)
 
     def mouth(self) -> Pit | None:

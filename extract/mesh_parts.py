@@ -216,7 +216,7 @@ def _spout_outlet(spout: Part, hollow: Hollow, vertices: Array, faces: Faces) ->
         mouth = local[forward > forward.max() - 0.0025]
         middle = 0.5 * (mouth.min(axis=0) + mouth.max(axis=0))
         middle[1] = 0.0
-        if middle[2] < low + 0.6 * height:
+        if middle[2] < low + 0.6 * height and elevation < 1.5:
             continue  # a bend
         middle += (forward.max() - middle @ run) * run
         radius = max(0.5 * float(np.ptp(mouth[:, 1])) - hollow.wall_m, 0.001)

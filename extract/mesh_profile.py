@@ -61,6 +61,11 @@ class Hollow:
         return float(np.trapezoid(ring_areas(self.inner_m), self.z_m))
 
     @property
+    def middles_m(self) -> Array:
+        """(L, 2) where the middle of each section is, from the axis."""
+        return _centroids(self.inner_m)
+
+    @property
     def throat_m(self) -> float:
         """Half width of the narrowest section above the widest one."""
         half = half_widths(self.inner_m)
@@ -72,9 +77,9 @@ def ring_angles(count: int = RAYS) -> Array:
     return np.asarray(2 * np.pi * (np.arange(count) + 0.5) / count)
 
 
-def ray_toward(angle_rad: Any, count: int = RAYS) -> Any:
+def ray_toward(angle_rad: Any) -> Any:
     """Index of the ray nearest to an angle, or to each of an array of them."""
-    return np.floor_divide(np.mod(angle_rad, 2 * np.pi), 2 * np.pi / count).astype(np.int64) % count
+    return np.floor_divide(np.mod(angle_rad, 2 * np.pi), 2 * np.pi / RAYS).astype(np.int64) % RAYS
 
 
 def ring_areas(rings_m: Array) -> Array:
@@ -290,7 +295,7 @@ def _outer(
     parts_z, parts = [z], [beside]
     below = radial_hits(vertices, faces, axis, foot, RAYS, MOST_HITS)
     parts_z.insert(0, foot)
-    parts.insert(0, _bounded(_last(below), beside[0]))
+    parts.insert(0, _foot(below, beside[0]))
     if not is_open:
         column = columns.hits[columns.disc(axis, 3 * columns.cell_m)]
         above = np.where(column > z[-1] + 1e-4, column, np.inf).min(axis=1)
@@ -302,19 +307,11 @@ def _outer(
     return np.concatenate(parts_z), np.concatenate(parts)
 
 
-def _last(hits: Array) -> Array:
-    return np.asarray(np.where(np.isfinite(hits), hits, -np.inf).max(axis=2))
-
-
-def _bounded(rings: Array, above: Array) -> Array:
-    """Rings of a foot with what sticks out (a handle that reaches low) bridged, and what is missing copied."""
-    rings = np.where(np.isfinite(rings), rings, np.nan)
-    clean = np.repeat(above[None], len(rings), axis=0)
-    for level, ring in enumerate(rings):
-        bridged = _without_jumps(np.where(np.isnan(ring), np.inf, ring))
-        if bridged is not None:
-            clean[level] = bridged
-    return clean
+def _foot(hits: Array, above: Array) -> Array:
+    """Outer rings below the floor: what sticks out (a handle that reaches low) bridged, what is missing as above it."""
+    rings = np.where(np.isfinite(hits), hits, -np.inf).max(axis=2)
+    bridged = [_without_jumps(np.where(np.isfinite(ring), ring, np.inf)) for ring in rings]
+    return np.stack([above if ring is None else ring for ring in bridged])
 
 
 def _holes(out: NDArray[np.bool_], inner: Array, z: Array, axis: Array) -> tuple[Hole, ...]:

@@ -27,16 +27,19 @@ from .vessels import CATEGORIES, make_vessel, resolve_category
 SUPPORTS = 48
 SURFACE_POINTS = 30_000
 MAX_COLORS = 6
-# What less could hold or let out: particles are 5 mm thick at least, and jam in a neck of fewer than three.
+# Particles are 5 mm thick at least; less holds too few of them, or jams.
 MIN_VOLUME_M3, MIN_THROAT_M = 15e-6, 0.006
 # A closed mesh is cut open where it is at least so wide, in half, and so wide as a share of its widest.
 CUT_HALF_WIDTH_M, CUT_SHARE = 0.009, 0.25
-# Thick walls are of ceramic or glass, thin ones of plastic or card; steel is as heavy as three times its thickness.
+# What is in a vessel fills at least so much of it, box by box.
+CONTENTS_SHARE = 0.1
+# Where the name does not tell, thick walls are taken for ceramic or glass, thin ones for plastic or card.
 THICK_WALL_M, THICK_KG_M3, THIN_KG_M3 = 0.0025, 2300.0, 1000.0
+# Spread of a round outline's distances, and difference between an outline and itself turned, as shares of its size.
 ROUND, FOLD = 0.05, 0.012
 # A body that is longer than wide by so much and fills so much of its bounding box stands on its end.
 LONG_BODY, FULL_BODY = 1.35, 0.45
-SNAP_RAD = math.radians(4)
+SNAP_RAD, MAX_LEAN_RAD = math.radians(4), math.radians(6)
 
 
 def vessel_from_mesh(path: Path | str, unit: str = "auto", *, up: str = "auto", open_top: bool = False) -> Vessel:
@@ -83,6 +86,8 @@ def _measured(mesh: Any, name: str, up: str, open_top: bool) -> tuple[Vessel, st
     vertices = np.asarray(mesh.vertices, np.float64)
     faces = np.asarray(mesh.faces, np.int64)
     colors = np.asarray(mesh.visual.face_colors, np.uint8)
+    if (thin_m := float(np.ptp(vertices, axis=0).min())) < MIN_THROAT_M:
+        raise UserError(f"it is only {1000 * thin_m:.1f} mm thick; check the unit (--mesh-unit)")
     kept = _without_contents(mesh, vertices, faces)
     faces, colors = faces[kept], colors[kept]
     if up == "auto":
@@ -167,6 +172,12 @@ def _check(hollow: Hollow, has_mouth: bool) -> None:
             f"its opening is {2000 * hollow.throat_m:.1f} mm wide, where particles jam below {2000 * MIN_THROAT_M:.0f} "
             "mm; check the unit (--mesh-unit)"
         )
+    leaning = float(np.arctan(np.linalg.norm(np.polyfit(hollow.z_m, hollow.middles_m, 1)[0])))
+    if leaning > MAX_LEAN_RAD:
+        raise UserError(
+            f"it leans by about {math.degrees(leaning):.0f} degrees in its file; turn it upright there, or say which "
+            "axis is up with --mesh-up"
+        )
     widest = float(half_widths(hollow.inner_m).max())
     if widest < 1.5 * MIN_THROAT_M:
         raise UserError(f"its hollow is only {2000 * widest:.0f} mm wide; check the unit (--mesh-unit)")
@@ -181,14 +192,13 @@ def _without_contents(mesh: Any, vertices: Array, faces: Faces) -> np.ndarray[An
     kept = np.ones(len(faces), bool)
     for label in np.unique(labels):
         mine = labels == label
-        rest = kept & ~mine
-        if not rest.any():
+        body, rest = vertices[np.unique(faces[mine])], kept & ~mine
+        around = vertices[np.unique(faces[rest])] if rest.any() else body
+        inside = np.all(body.min(axis=0) > around.min(axis=0)) and np.all(body.max(axis=0) < around.max(axis=0))
+        if not inside or np.prod(np.ptp(body, axis=0)) < CONTENTS_SHARE * np.prod(np.ptp(around, axis=0)):
             continue
-        body = trimesh.Trimesh(vertices, faces[mine], process=False)
-        bounds, around = body.bounds, vertices[np.unique(faces[rest])]
-        inside = np.all(bounds[0] > around.min(axis=0)) and np.all(bounds[1] < around.max(axis=0))
-        large = abs(body.volume) > 0.1 * float(np.prod(np.ptp(around, axis=0)))
-        if inside and large and body.is_watertight and find_up(vertices, faces[rest]) is not None:
+        closed = trimesh.Trimesh(vertices, faces[mine], process=False).is_watertight
+        if closed and find_up(vertices, faces[rest]) is not None:
             kept = rest
     return kept
 
@@ -216,21 +226,18 @@ def _cut_open(points: Array, faces: Faces, colors: Any) -> tuple[Array, Faces, A
     """The mesh without what lies above the highest place where it is one closed, wide enough outline."""
     import trimesh
 
-    try:
-        hollow = find_hollow(points, faces)
-    except UserError:
-        hollow = None
-    if hollow is None or hollow.is_open:
+    hollow = find_hollow(points, faces)
+    if hollow.is_open:
         raise UserError("it has an opening already; leave out --mesh-open-top (open_top)")
     half = half_widths(hollow.inner_m)
     wide = np.flatnonzero(half > max(CUT_HALF_WIDTH_M, CUT_SHARE * float(half.max())))
     if len(wide) == 0:
         raise UserError(f"it is nowhere wider than {2000 * CUT_HALF_WIDTH_M:.0f} mm; check the unit (--mesh-unit)")
     z_m = float(hollow.z_m[wide[-1]])
-    for column in hollow.holes or ():
-        # Where a scan saw a little way into the opening its surface is folded: below that.
-        if column.radius_m > 0.5 * half[wide[-1]]:
-            z_m = min(z_m, float(column.center_m[2]) - column.radius_m)
+    for hole in hollow.holes:
+        # A scanner that saw a little way into the opening folded the surface inward there: below that.
+        if hole.radius_m > 0.5 * half[wide[-1]]:
+            z_m = min(z_m, float(hole.center_m[2]) - hole.radius_m)
     mesh = trimesh.Trimesh(points, faces, process=False)
     intersections: Any = trimesh.intersections
     cut, new_faces, _ = intersections.slice_faces_plane(

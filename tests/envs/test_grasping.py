@@ -35,10 +35,10 @@ def test_what_is_too_wide_is_held_by_the_wall_at_its_rim() -> None:
     bowl = make_vessel("bowl")
     assert all(region.width_m > MAX_WIDTH_M for region in bowl.grasps)
     for grasp in grasp_candidates(bowl):
-        assert grasp.width_m == bowl.wall_m
+        assert bowl.wall_m < grasp.width_m < bowl.wall_m + 0.002
         below_rim_m = bowl.interior.z_m[-1] - grasp.T_object_hand[2, 3]
         assert 0.0 < below_rim_m < 0.02
-        assert gripper_half_width_m(bowl, grasp.T_hand_object) == pytest.approx(bowl.wall_m / 2, abs=0.004)
+        assert gripper_half_width_m(bowl, grasp.T_hand_object) == pytest.approx(grasp.width_m / 2, abs=0.003)
         # From above, or from a side of it, and never at the lip.
         assert grasp.T_object_hand[2, 2] < 0
         assert grasp.T_object_hand[0, 3] < 0.03
