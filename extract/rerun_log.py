@@ -21,7 +21,7 @@ def load_rerun() -> Any:
     try:
         import rerun
     except ImportError as error:
-        raise UserError("--rerun needs rerun-sdk, which is missing; run `pip install 'vid2demo[lerobot]'`") from error
+        raise UserError("--rerun needs rerun-sdk, which is missing; run `pip install 'vid2demo[rerun]'`") from error
     return rerun
 
 
