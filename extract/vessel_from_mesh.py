@@ -219,7 +219,10 @@ def _up_of_closed(vertices: Array, faces: Faces) -> str:
     ups.sort(key=lambda up: -bases[up])
     if bases[ups[0]] > 1.4 * bases[ups[1]]:
         return ups[0]
-    raise UserError("no opening was found in any of the six axis directions; say which is up with --mesh-up (up)")
+    raise UserError(
+        "no opening was found in any of the six axis directions; say which is up with --mesh-up (up) and, if it stands "
+        "for a full container, cut it open there with --mesh-open-top (open_top)"
+    )
 
 
 def _cut_open(points: Array, faces: Faces, colors: Any) -> tuple[Array, Faces, Any]:

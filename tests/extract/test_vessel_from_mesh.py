@@ -40,6 +40,12 @@ def cup(height_m: float = 0.1, wall_m: float = 0.003) -> trimesh.Trimesh:
     )
 
 
+def leaning(angle_deg: float) -> trimesh.Trimesh:
+    """A tall tumbler askew."""
+    mesh = make_vessel("tumbler").mesh.copy()
+    return mesh.apply_transform(trimesh.transformations.rotation_matrix(math.radians(angle_deg), [1, 0, 0]))
+
+
 @pytest.mark.parametrize("category", CATEGORIES)
 def test_the_librarys_own_meshes_are_measured_right(category: str) -> None:
     for seed in (None, 3):
@@ -127,6 +133,8 @@ def test_contents_modelled_in_a_vessel_are_left_out() -> None:
         (trimesh.creation.cone(0.04, 0.15), "open_top"),
         (tube([(0.02, 0.0), (0.04, 0.0), (0.04, 0.1), (0.02, 0.1)]), "which is up with --mesh-up"),
         (cup(height_m=0.1).apply_scale(0.2), "ml, too little"),
+        (leaning(20.0), "leans by about .* degrees in its file"),
+        (trimesh.creation.box((0.1, 0.1, 0.002)), r"only 2\.0 mm thick"),
         (cup().slice_plane((0, 0, 0.05), (0, 0, 1)), "no bottom"),
     ],
 )
