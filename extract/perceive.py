@@ -35,7 +35,7 @@ from .track import ObjectTrack
 from .video import Image, VideoInfo, iterate_frames, read_video_info
 
 SMOOTHING_BANDWIDTH_S = 0.06
-TRUSTED_CONFIDENCE = 0.5  # mean over the clip, of an object that nobody pointed at
+TRUSTED_CONFIDENCE = 0.6  # mean over the clip, of an object that nobody pointed at
 SURE_OF_CAMERA = 0.5  # median share of the background that agrees on how the camera turned
 SEEN_SHARE = 0.1  # of the clip, least
 GOOD_IOU = 0.75  # of the first frame's silhouette, below which other frames are looked at as well
