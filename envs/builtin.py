@@ -28,8 +28,8 @@ LIFT_S, MOVE_S, TILT_S, HOLD_S = 1.0, 1.4, 2.4, 1.0
 SPOUT_HOLD_S = 2.5
 # Where the vessel and the receptacle stand, and where +x of the vessel points, unless that is out of the arm's reach.
 START_XY_M, RECEPTACLE_XY_M, HEADING_DEG = (0.5, -0.25), (0.5, 0.1), 90.0
-# The least tilt that empties an open or a spouted vessel; grains slide off a wall that slopes so much.
-LIP_TILT_DEG, SPOUT_TILT_DEG, SLIDE_DEG, MAX_TILT_DEG = 110.0, 85.0, 10.0, 150.0
+# The least and the greatest tilt that empties an open or a spouted vessel; grains slide off a wall that slopes so much.
+LIP_TILT_DEG, SPOUT_TILT_DEG, SLIDE_DEG = (110.0, 150.0), (85.0, 120.0), 10.0
 # What may stay in a vessel of its filling; shares of the mouth within which the stream is to land.
 LEFT_SHARE, SAFE_SHARE = 0.03, 0.5
 # Grasps that are followed along the whole motion, the most comfortable at its start.
@@ -163,18 +163,18 @@ def emptying_tilt_deg(vessel: Vessel, receptacle: Vessel) -> float:
     spouted = vessel.outlet.kind == "spout"
     gates = [vessel.outlet.point_m] if vessel.outlet.entry_m is None else [vessel.outlet.point_m, vessel.outlet.entry_m]
     left = LEFT_SHARE * filling_m3(vessel, receptacle) / cavity.volume_m3
-    tilt_deg = SPOUT_TILT_DEG if spouted else LIP_TILT_DEG
+    tilt_deg, most_deg = SPOUT_TILT_DEG if spouted else LIP_TILT_DEG
     if not spouted:
         # A shoulder that narrows toward the rim must slope down as well.
         narrowing = np.arctan2(-np.diff(cavity.support_m[:, 0]), np.diff(cavity.z_m))
         tilt_deg = max(tilt_deg, 90.0 + SLIDE_DEG + float(np.rad2deg(narrowing.max())))
-    while tilt_deg < MAX_TILT_DEG:
+    while tilt_deg < most_deg:
         up = np.array([-math.sin(math.radians(tilt_deg)), 0.0, math.cos(math.radians(tilt_deg))])
         gate = max(float(point @ up) for point in gates)
         if np.mean(points @ up < gate) <= left:
             break
         tilt_deg += 5.0
-    return min(tilt_deg, MAX_TILT_DEG)
+    return min(tilt_deg, most_deg)
 
 
 def pour_motion(vessel: Vessel, receptacle: Vessel, plan: Plan, control_hz: float) -> tuple[Array, Array, Array]:
