@@ -236,7 +236,7 @@ def test_without_the_viewer_s_package_the_way_to_get_it_is_told(
     clip: Path, mesh_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
-    with pytest.raises(UserError, match=r"pip install 'vid2demo\[lerobot\]'"):
+    with pytest.raises(UserError, match=r"pip install 'vid2demo\[rerun\]'"):
         follow(clip, mesh_file, tmp_path / "out", rerun=True)
     assert not (tmp_path / "out").exists()
 
