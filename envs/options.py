@@ -112,8 +112,9 @@ def load_reference(
     receptacle: str | Path | Vessel | None = None,
 ) -> Reference:
     """A reference from a file, as given, or the built-in one, at the control rate and with these vessels."""
+    from ..extract.any_vessel import resolve_vessel
     from .builtin import builtin_reference
-    from .substitution import resolve_vessel, with_receptacle, with_vessel
+    from .substitution import with_receptacle, with_vessel
 
     held = None if vessel is None else resolve_vessel(vessel, "vessel")
     standing = None if receptacle is None else resolve_vessel(receptacle, "receptacle")

@@ -2,29 +2,15 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..extract.errors import UserError
 from ..extract.geometry import Array
 from .reference import Reference, vessel_to_header
 
 if TYPE_CHECKING:
     from ..extract.vessels import Vessel
-
-
-def resolve_vessel(value: str | Path | Vessel, role: str) -> Vessel:
-    """A vessel from its category ("mug"), a seeded variant ("mug:3"), or as it is; `role` names it in errors."""
-    from ..extract.vessels import Vessel, make_vessel
-
-    if isinstance(value, Vessel):
-        return value
-    category, _, seed = str(value).partition(":")
-    if seed and not seed.isdecimal():
-        raise UserError(f"{role} is {value!r}; after the colon give a seed, a whole number from 0")
-    return make_vessel(category, int(seed) if seed else None)
 
 
 def with_receptacle(reference: Reference, receptacle: Vessel) -> Reference:

@@ -349,7 +349,7 @@ def test_a_start_that_spills_is_said_in_info(mug_pour: Reference, actions_of: Ac
         ({"start": "middle"}, "start is 'middle'; choose beginning, reference"),
         ({"tolerance": 0.0}, "tolerance is 0.0"),
         ({"vessel": "mug:x"}, "vessel is 'mug:x'"),
-        ({"receptacle": "mugg"}, "unknown vessel category 'mugg'"),
+        ({"receptacle": "mugg"}, "receptacle is 'mugg'"),
         ({"reference": 3}, "reference is a int"),
         ({"reference": "nowhere.reference.npz"}, "nowhere.reference.npz does not exist"),
         ({"num_particles": 500, "liquid": Liquid(radius_m=0.01)}, "holds at most"),
