@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import vid2demo
 from vid2demo import cli
+from vid2demo.extract.command import Command, Staged
 from vid2demo.extract.errors import UserError
 from vid2demo.extract.video import VideoWriter
 
@@ -46,7 +47,7 @@ def test_help_names_every_command_and_begins_at_once() -> None:
 
 def test_commands_of_the_design_are_there() -> None:
     wanted = {"run", "extract", "retarget", "simulate", "play", "collect", "replay", "meshes", "synthesize", "report"}
-    assert set(cli.COMMANDS) == {*wanted, "demo", "compare-track"}
+    assert {name.split()[0] for name in cli.COMMANDS} == {*wanted, "demo", "compare-track"}
 
 
 @pytest.mark.parametrize("name", list(cli.COMMANDS))
@@ -54,13 +55,13 @@ def test_help_of_each_command_has_an_example_and_tells_every_option(
     name: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit) as stop:
-        cli.main([name, "--help"])
+        cli.main([*name.split(), "--help"])
     assert stop.value.code == 0
     text = " ".join(capsys.readouterr().out.replace("│", " ").split())
     assert f"For example: vid2demo {name}" in text
     for option, hint in typing.get_type_hints(cli.COMMANDS[name], include_extras=True).items():
         assert "help='" in repr(hint) or 'help="' in repr(hint), f"{option} has no help"
-    if name not in ("play", "replay", "report", "meshes", "compare-track"):
+    if issubclass(cli.COMMANDS[name], Staged):
         assert "--out DIR" in text
         assert "--force" in text
     assert "--json" in text
@@ -78,6 +79,22 @@ def test_version_is_the_package_s(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_unknown_command_is_answered_with_the_nearest(capsys: pytest.CaptureFixture[str]) -> None:
     assert "did you mean retarget?" in refused(capsys, "retrget")
+
+
+@pytest.mark.parametrize("words", [["meshes", "--help"], ["meshes", "-h"], ["meshes"]])
+def test_a_word_with_commands_below_it_lists_them(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(words) == (0 if words[1:] else 2)
+    told = capsys.readouterr().out
+    below = [name for name in cli.COMMANDS if name.startswith("meshes ")]
+    assert len(below) >= 3
+    assert all(f"  {name} " in told for name in below)
+    assert "retarget" not in told
+
+
+def test_unknown_command_below_a_word_is_answered_with_the_nearest(capsys: pytest.CaptureFixture[str]) -> None:
+    line = refused(capsys, "meshes", "lst")
+    assert "did you mean meshes list?" in line
+    assert "meshes export" in line
 
 
 @pytest.mark.parametrize(
@@ -206,7 +223,7 @@ def test_meshes_without_what_they_need_are_refused(capsys: pytest.CaptureFixture
 
 
 def test_interruption_says_how_to_go_on(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    def interrupt(self: cli.Command) -> None:
+    def interrupt(self: Command) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(cli.Report, "do", interrupt)
@@ -217,7 +234,7 @@ def test_interruption_says_how_to_go_on(monkeypatch: pytest.MonkeyPatch, capsys:
 
 
 def test_errors_of_the_program_itself_are_not_hidden(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(self: cli.Command) -> None:
+    def fail(self: Command) -> None:
         raise ValueError("a fault of ours")
 
     monkeypatch.setattr(cli.Report, "do", fail)

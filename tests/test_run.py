@@ -7,21 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from vid2demo.demos.steps import collect_stage, joints_path, reference_path
 from vid2demo.extract.errors import UserError
 from vid2demo.extract.progress import Progress
 from vid2demo.extract.stages import Stage
+from vid2demo.extract.steps import ObjectSettings, extract_stage, settings_record
 from vid2demo.extract.video import VideoWriter
-from vid2demo.run import (
-    ObjectSettings,
-    RunSettings,
-    collect_stage,
-    extract_stage,
-    joints_path,
-    reference_path,
-    run,
-    settings_record,
-    stages_of,
-)
+from vid2demo.run import RunSettings, run, stages_of
 
 KETTLE = RunSettings(Path("coffee.mp4"), ObjectSettings("kettle"), ObjectSettings("mug"))
 

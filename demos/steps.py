@@ -1,0 +1,139 @@
+"""The stages of this room: a track placed before the robot, joints found for it, poured along, and collected."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+from ..extract.files import write_json
+from ..extract.progress import Progress
+from ..extract.stages import Stage, plain
+
+ROOMS = ("extract", "envs", "demos")  # whose code decides what comes out here
+
+
+def reference_path(track: Path, folder: Path) -> Path:
+    """`folder/kettle.reference.npz` for a track `kettle.track.npz`."""
+    return folder / f"{_stem(track)}.reference.npz"
+
+
+def joints_path(reference: Path, folder: Path) -> Path:
+    """`folder/kettle.joints.npz` for a track or a reference of the kettle."""
+    return folder / f"{_stem(reference)}.joints.npz"
+
+
+def reference_stage(
+    track: Path,
+    receptacle_track: Path | None,
+    folder: Path,
+    *,
+    receptacle: str | None = None,
+    scale: float | Literal["auto"] = "auto",
+    seed: int = 0,
+) -> Stage:
+    """NAME.track.npz (and the receptacle's) -> NAME.reference.npz. receptacle: a library vessel to stand there."""
+    output = reference_path(track, folder)
+
+    def work(progress: Progress) -> Mapping[str, Any]:
+        from ..envs.placement import build_reference
+        from ..extract.track import ObjectTrack
+        from ..extract.vessels import make_vessel, resolve_category
+
+        vessel = make_vessel(resolve_category(receptacle)[0]) if receptacle else None
+        seen = ObjectTrack.load(receptacle_track) if receptacle_track else None
+        reference = build_reference(ObjectTrack.load(track), seen, scale=scale, receptacle=vessel, seed=seed)
+        reference.save(output)
+        return {
+            "knots": len(reference),
+            "duration_s": reference.duration_s,
+            "scale": reference.scale,
+            "largest_tilt_deg": math.degrees(float(reference.tilt_rad.max())),
+        }
+
+    return Stage(
+        "reference",
+        "place the motion in the robot's workspace",
+        work,
+        {"scale": scale, "seed": seed, "receptacle": receptacle},
+        {"track": track} | ({"receptacle track": receptacle_track} if receptacle_track else {}),
+        (output.name,),
+        ("extract", "envs"),
+    )
+
+
+def retarget_stage(reference: Path, folder: Path) -> Stage:
+    """NAME.reference.npz -> NAME.joints.npz and feasibility.json."""
+    output = joints_path(reference, folder)
+
+    def work(progress: Progress) -> Mapping[str, Any]:
+        from ..envs.reference import Reference
+        from .feasibility import feasibility
+        from .retarget import retarget
+
+        wanted = Reference.load(reference)
+        joints = retarget(wanted)
+        joints.save(output)
+        findings = plain(feasibility(wanted, joints))
+        write_json(folder / "feasibility.json", findings)
+        shown = ("feasible", "position_error_m", "rotation_error_rad", "words")
+        return {name: findings[name] for name in shown if name in findings}
+
+    return Stage(
+        "retarget",
+        "find the joint motion",
+        work,
+        {},
+        {"reference": reference},
+        (output.name, "feasibility.json"),
+        ROOMS,
+    )
+
+
+def simulate_stage(reference: Path, joints: Path, video: Path | None, folder: Path) -> Stage:
+    """Reference and joints (and the video) -> simulation.mp4 and series.json."""
+
+    def work(progress: Progress) -> Mapping[str, Any]:
+        from .simulate import simulate
+
+        result = plain(simulate(reference, joints, video, folder / "simulation.mp4", progress=progress))
+        write_json(folder / "series.json", result["series"])
+        return {name: value for name, value in result.items() if name != "series"}
+
+    return Stage(
+        "simulate",
+        "let the robot pour",
+        work,
+        {},
+        {"reference": reference, "joints": joints} | ({"video": video} if video else {}),
+        ("simulation.mp4", "series.json"),
+        ROOMS,
+    )
+
+
+def collect_stage(reference: Path, folder: Path, *, episodes: int, seed: int, replace: bool = False) -> Stage:
+    """Reference -> dataset/ of verified episodes. replace: also where a dataset of another reference is."""
+
+    def work(progress: Progress) -> Mapping[str, Any]:
+        from .collect import collect, useful_workers
+
+        dataset, workers = folder / "dataset", useful_workers(episodes)
+        return collect(
+            reference, dataset, episodes=episodes, seed=seed, workers=workers, force=replace, progress=progress
+        )
+
+    return Stage(
+        "collect",
+        "collect demonstrations, each replayed before it is kept",
+        work,
+        {"episodes": episodes, "seed": seed},
+        {"reference": reference},
+        ("dataset",),
+        ROOMS,
+    )
+
+
+def _stem(path: Path) -> str:
+    """`kettle` of `runs/coffee/kettle.track.npz`."""
+    return path.name.removesuffix(".npz").rpartition(".")[0] or path.stem

@@ -1,0 +1,174 @@
+"""The commands of this room: follow objects in a video, measure tracks, look at vessels, render clips."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from tyro.conf import Positional, arg
+
+from .command import Box, Category, Command, Commands, MeshUnit, Receiver, Result, Seed, Staged, told
+
+if TYPE_CHECKING:
+    from .steps import VideoSettings
+
+MeshName = Positional[Annotated[str | None, arg(metavar="NAME", help="A category of the library or a word for one.")]]
+MeshSeed = Annotated[int | None, told("N", "A seeded variant [integer]. Default: the nominal one.")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class FromVideo(Staged):
+    """A command that looks at a video."""
+
+    video: Positional[Annotated[Path, arg(metavar="VIDEO", help="The clip: any file with a video that FFmpeg reads.")]]
+    object: Annotated[str, arg(metavar="NAME", help="What is handled: a word such as kettle; see `meshes list`.")]
+    receptacle: Annotated[
+        str | None,
+        told("NAME", "What is poured into, such as mug. Default: not followed; one stands under the lip."),
+    ] = None
+    box: Annotated[Box | None, told("X Y W H", "The object's box in the start frame [px]. Default: found.")] = None
+    receptacle_box: Annotated[Box | None, told("X Y W H", "The receptacle's box there [px]. Default: found.")] = None
+    camera: Annotated[Box | None, told("FX FY CX CY", "Intrinsics [px]. Default: f = sqrt(w^2 + h^2), centred.")] = None
+    mesh: Annotated[Path | None, told("FILE", "Your mesh: obj, ply, stl, glb. Default: the library's.")] = None
+    mesh_unit: MeshUnit = "auto"
+    mask: Annotated[Path | None, told("PNG", "The object in the start frame, white on black. Default: cut.")] = None
+    start_frame: Annotated[int | None, told("N", "Frame of box and mask; followed both ways. Default: chosen.")] = None
+    camera_motion: Annotated[Literal["auto", "static", "moving"], arg(help="Whether the camera moves.")] = "auto"
+    rerun: Annotated[bool, told(None, "Write extract.rrd as well, for the Rerun viewer.")] = False
+    seed: Seed = 0
+
+    def settings(self) -> VideoSettings:
+        from .steps import ObjectSettings, VideoSettings
+
+        return VideoSettings(
+            self.video,
+            ObjectSettings(self.object, self.box, self.mesh, self.mesh_unit, self.mask),
+            ObjectSettings(self.receptacle, self.receptacle_box) if self.receptacle else None,
+            camera=self.camera,
+            start_frame=self.start_frame,
+            camera_motion=self.camera_motion,
+            rerun=self.rerun,
+            seed=self.seed,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Extract(FromVideo):
+    """Follow the objects in a video: writes NAME.track.npz of each, and overlay.mp4 to look at.
+
+    For example: vid2demo extract coffee.mp4 --object kettle --box 410 120 90 140 --out runs/coffee
+    """
+
+    def do(self) -> Result:
+        from .steps import extract_stage, settings_record, video_identity
+
+        settings, identity = self.settings(), video_identity(self.video)
+        return self.do_stages([extract_stage(settings, self.out)], settings_record(settings), identity)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompareTrack(Command):
+    """Measure a track against the truth: the paper's errors of motion, and errors of single poses.
+
+    For example: vid2demo compare-track runs/coffee/kettle.track.npz truth.npz --mesh kettle.obj --mesh-unit mm
+    """
+
+    estimate: Positional[Annotated[Path, arg(metavar="ESTIMATE", help="A *.track.npz, as `extract` writes it.")]]
+    truth: Positional[Annotated[Path, arg(metavar="TRUTH", help="A track, or an npz of its arrays; see the README.")]]
+    mesh: Annotated[Path | None, told("FILE", "The object's mesh in the truth's frame. Default: no ADD.")] = None
+    mesh_unit: MeshUnit = "auto"
+    symmetry_order: Annotated[
+        int | None, told("N", "Turns about +z that look the same, 0 for any [count]. Default: the truth's own.")
+    ] = None
+    out: Annotated[Path | None, told("FILE", "Write the figures to this JSON file. Default: only print.")] = None
+
+    def do(self) -> Result:
+        from .compare import compare_files
+
+        return compare_files(self.estimate, self.truth, self.mesh, self.mesh_unit, self.symmetry_order, self.out)
+
+    def words(self, result: Result) -> str:
+        from .compare import Comparison
+
+        return Comparison.from_json(result).table()
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeshesList(Command):
+    """List the categories of the library with the measures of each.
+
+    For example: vid2demo meshes list
+    """
+
+    def do(self) -> Result:
+        from .catalogue import list_categories
+
+        return list_categories()
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeshesShow(Command):
+    """Show a vessel's measures and its parameters with their ranges.
+
+    For example: vid2demo meshes show mug --seed 3
+    """
+
+    name: MeshName = None
+    seed: MeshSeed = None
+
+    def do(self) -> Result:
+        from .catalogue import describe
+
+        return describe(self.name, self.seed)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeshesExport(Command):
+    """Write a vessel's mesh, in m, and its description to a folder.
+
+    For example: vid2demo meshes export mug --out meshes --format stl
+    """
+
+    name: MeshName = None
+    out: Annotated[Path | None, arg(metavar="DIR", help="Folder to export to.")] = None
+    format: Annotated[Literal["obj", "stl", "ply", "glb"], arg(help="File format; lengths in m.")] = "obj"
+    seed: MeshSeed = None
+
+    def do(self) -> Result:
+        from .catalogue import export
+
+        return export(self.name, self.seed, self.out, self.format)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Synthesize(Staged):
+    """Render a clip of a pour with exact truth: video.mp4, truth.track.npz, receptacle.track.npz, settings.json.
+
+    For example: vid2demo synthesize --category mug --seed 0 --out runs/clip
+    """
+
+    category: Category = "mug"
+    receptacle: Receiver = "bowl"
+    seconds: Annotated[float, arg(metavar="S", help="Length of the clip [s].")] = 6.0
+    fps: Annotated[float, arg(metavar="HZ", help="Frame rate [Hz].")] = 25.0
+    size: Annotated[tuple[int, int], arg(metavar="W H", help="Size of the picture [px], even numbers.")] = (640, 480)
+    without_hand: Annotated[bool, told(None, "Leave out the hand that hides a part of the vessel.")] = False
+    seed: Seed = 0
+
+    def do(self) -> Result:
+        from .steps import synthesize_stage
+
+        settings = {"category": self.category, "receptacle": self.receptacle, "seed": self.seed, "size": self.size}
+        settings |= {"seconds": self.seconds, "fps": self.fps, "occluder": not self.without_hand}
+        return self.do_stages([synthesize_stage(self.out, settings)], settings)
+
+
+COMMANDS: Commands = {
+    "extract": Extract,
+    "compare-track": CompareTrack,
+    "meshes list": MeshesList,
+    "meshes show": MeshesShow,
+    "meshes export": MeshesExport,
+    "synthesize": Synthesize,
+}

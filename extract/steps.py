@@ -1,0 +1,138 @@
+"""The stages of this room: a clip rendered, the objects of a video followed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from .progress import Progress
+from .stages import Stage, plain
+from .wording import symmetry_in_words
+
+
+@dataclass(frozen=True)
+class ObjectSettings:
+    """One object to follow.
+
+    name: what it is called and, without a mesh, its category in the vessel library.
+    box_xywh_px: its box in the start frame, or None: found by the program.
+    mesh, mesh_unit: the user's own mesh file and its unit ("auto", "m", "cm", "mm", "in").
+    mask: picture of the object in the start frame, white on black.
+    """
+
+    name: str
+    box_xywh_px: tuple[float, float, float, float] | None = None
+    mesh: Path | None = None
+    mesh_unit: str = "auto"
+    mask: Path | None = None
+
+
+@dataclass(frozen=True)
+class VideoSettings:
+    """What decides the tracks of a video's objects.
+
+    camera: (fx, fy, cx, cy) in px, or None: the focal prior.
+    start_frame: the frame that boxes and masks belong to, or None: the first, or the best where none are given.
+    rerun: whether to write extract.rrd.
+    """
+
+    video: Path
+    object: ObjectSettings
+    receptacle: ObjectSettings | None = None
+    camera: tuple[float, float, float, float] | None = None
+    start_frame: int | None = None
+    camera_motion: Literal["auto", "static", "moving"] = "auto"
+    rerun: bool = False
+    seed: int = 0
+
+
+def video_identity(path: Path) -> dict[str, Any]:
+    """What `run.json` keeps of a video. Raises UserError when it cannot be read."""
+    from .video import read_video_info
+
+    info = read_video_info(path)
+    size = {"width_px": info.width_px, "height_px": info.height_px, "frames": info.frame_count}
+    return {"path": str(path), "sha256": info.sha256, **size, "duration_s": info.duration_s}
+
+
+def settings_record(settings: VideoSettings) -> dict[str, Any]:
+    """The settings as `run.json` keeps them."""
+    return dict(plain(asdict(settings)))
+
+
+def synthesize_stage(folder: Path, settings: Mapping[str, Any]) -> Stage:
+    """Settings of `extract.synthetic.synthesize` -> a clip with its truth."""
+
+    def work(progress: Progress) -> Mapping[str, Any]:
+        from .synthetic import synthesize
+
+        clip = synthesize(out=folder, **settings, progress=progress)
+        return {"frames": len(clip.truth), "boxes_xywh_px": clip.boxes_xywh_px}
+
+    outputs = ("video.mp4", "truth.track.npz", "receptacle.track.npz", "settings.json")
+    return Stage("synthesize", "render a clip with exact truth", work, plain(settings), {}, outputs, ("extract",))
+
+
+def extract_stage(settings: VideoSettings, folder: Path) -> Stage:
+    """Video -> NAME.track.npz of each object, and overlay.mp4."""
+    objects = [settings.object, *([settings.receptacle] if settings.receptacle else [])]
+
+    def work(progress: Progress) -> Mapping[str, Any]:
+        from .perceive import ObjectRequest, extract
+
+        requests = [ObjectRequest(o.name, o.box_xywh_px, o.mesh, o.mesh_unit, o.mask) for o in objects]
+        tracks = extract(
+            settings.video,
+            requests,
+            camera=settings.camera,
+            start_frame=settings.start_frame,
+            camera_motion=settings.camera_motion,
+            rerun=settings.rerun,
+            out=folder,
+            seed=settings.seed,
+            progress=progress,
+        )
+        return {name: _track_figures(track) for name, track in tracks.items()}
+
+    told: dict[str, Any] = {
+        "objects": [asdict(o) | {"mesh": None, "mask": None} for o in objects],
+        "camera": settings.camera,
+    }
+    told |= {"start_frame": settings.start_frame, "camera_motion": settings.camera_motion, "seed": settings.seed}
+    files = {f"mesh of {o.name}": o.mesh for o in objects if o.mesh is not None}
+    files |= {f"mask of {o.name}": o.mask for o in objects if o.mask is not None}
+    outputs = [f"{o.name}.{kind}" for o in objects for kind in ("track.npz", "masks.npz", "mask.png")]
+    outputs += ["overlay.mp4", *(["extract.rrd"] if settings.rerun else [])]
+    return Stage(
+        "extract",
+        "follow the objects in the video",
+        work,
+        plain(told),
+        {"video": settings.video} | files,
+        tuple(outputs),
+        ("extract",),
+    )
+
+
+def _track_figures(track: Any) -> dict[str, Any]:
+    """What a person wants to know of an ObjectTrack at once."""
+    mesh, how = track.header.get("mesh", {}), track.header["settings"]
+    figures = {
+        "frames": len(track),
+        "visible_fraction": float(track.visible.mean()),
+        "mean_confidence": float(track.confidence.mean()),
+        "mesh": mesh.get("name"),
+        "place": f"{how['choice']}, box {' '.join(f'{v:g}' for v in how['box_xywh_px'])} in frame {how['start_frame']}",
+        "symmetry": symmetry_in_words(mesh["symmetry"]["order"]),
+    }
+    if cuts := track.header["video"].get("cuts"):
+        times = ", ".join(f"{cut['time_s']:.2f} s" for cut in cuts)
+        figures["cuts"] = f"the video jumps to another shot at {times}"
+    if (camera := track.header["camera"]["motion"]["kind"]) != "static":
+        figures["camera"] = camera
+    faces = mesh.get("faces", {})
+    if faces and faces["tracked"] < faces["in_file"]:
+        figures["decimated"] = f"{faces['in_file']} faces in the file, {faces['tracked']} tracked"
+    return figures
