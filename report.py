@@ -338,6 +338,8 @@ def _again(found: Found) -> str | None:
         words += ["--camera", *(f"{v:g}" for v in settings["camera"])]
     if mesh := _at(settings, "object", "mesh"):
         words += ["--mesh", str(mesh), "--mesh-unit", str(_at(settings, "object", "mesh_unit") or "auto")]
+        words += ["--mesh-up", str(_at(settings, "object", "mesh_up") or "auto")]
+        words += ["--mesh-open-top"] if _at(settings, "object", "mesh_open_top") else []
     words += ["--scale", str(settings.get("scale", "auto")), "--episodes", str(settings.get("episodes", 10))]
     return shlex.join([*words, "--seed", str(settings.get("seed", 0)), "--out", str(found.folder)])
 

@@ -28,6 +28,8 @@ class ObjectRequest:
     box_xywh_px: box in the start frame, in pixels of the video; found automatically when None.
     mesh: the object's own mesh file; mesh_unit: "m", "mm", "cm", "in" or "auto".
     mask: picture file of the object in the start frame, white on black, as large as the video.
+    mesh_up: axis of the mesh file that points out of the opening ("+y"), or "auto"; mesh_open_top: take a closed mesh
+        as a hollow open at its top. Tracking needs neither; who makes a vessel of the mesh finds both in the header.
     """
 
     name: str
@@ -35,6 +37,8 @@ class ObjectRequest:
     mesh: Path | None = None
     mesh_unit: str = "auto"
     mask: Path | None = None
+    mesh_up: str = "auto"
+    mesh_open_top: bool = False
 
     @property
     def pointed_at(self) -> bool:
@@ -68,6 +72,8 @@ def candidate_models(request: ObjectRequest) -> list[Model]:
         "name": request.mesh.name,
         "file": str(request.mesh),
         "unit": mesh.metadata["unit"],
+        "up": request.mesh_up,
+        "open_top": request.mesh_open_top,
         "unit_source": mesh.metadata["unit_source"],
         "sha256": mesh_sha256(mesh),
         "extents_m": [float(v) for v in mesh.extents],

@@ -13,6 +13,9 @@ from .command import Box, Category, Command, Commands, MeshUnit, Receiver, Resul
 if TYPE_CHECKING:
     from .steps import VideoSettings
 
+MeshUp = Annotated[
+    Literal["auto", "+x", "-x", "+y", "-y", "+z", "-z"], arg(help="Axis of --mesh that points out of its opening.")
+]
 MeshName = Positional[Annotated[str | None, arg(metavar="NAME", help="A category of the library or a word for one.")]]
 MeshSeed = Annotated[int | None, told("N", "A seeded variant [integer]. Default: the nominal one.")]
 
@@ -32,6 +35,8 @@ class FromVideo(Staged):
     camera: Annotated[Box | None, told("FX FY CX CY", "Intrinsics [px]. Default: f = sqrt(w^2 + h^2), centred.")] = None
     mesh: Annotated[Path | None, told("FILE", "Your mesh: obj, ply, stl, glb. Default: the library's.")] = None
     mesh_unit: MeshUnit = "auto"
+    mesh_up: MeshUp = "auto"
+    mesh_open_top: Annotated[bool, told(None, "Take a closed --mesh as a hollow that is open at its top.")] = False
     mask: Annotated[Path | None, told("PNG", "The object in the start frame, white on black. Default: cut.")] = None
     start_frame: Annotated[int | None, told("N", "Frame of box and mask; followed both ways. Default: chosen.")] = None
     camera_motion: Annotated[Literal["auto", "static", "moving"], arg(help="Whether the camera moves.")] = "auto"
@@ -43,7 +48,9 @@ class FromVideo(Staged):
 
         return VideoSettings(
             self.video,
-            ObjectSettings(self.object, self.box, self.mesh, self.mesh_unit, self.mask),
+            ObjectSettings(
+                self.object, self.box, self.mesh, self.mesh_unit, self.mask, self.mesh_up, self.mesh_open_top
+            ),
             ObjectSettings(self.receptacle, self.receptacle_box) if self.receptacle else None,
             camera=self.camera,
             start_frame=self.start_frame,

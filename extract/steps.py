@@ -20,6 +20,7 @@ class ObjectSettings:
     box_xywh_px: its box in the start frame, or None: found by the program.
     mesh, mesh_unit: the user's own mesh file and its unit ("auto", "m", "cm", "mm", "in").
     mask: picture of the object in the start frame, white on black.
+    mesh_up: axis of the mesh file that points out of the opening, or "auto"; mesh_open_top: cut a closed one open.
     """
 
     name: str
@@ -27,6 +28,8 @@ class ObjectSettings:
     mesh: Path | None = None
     mesh_unit: str = "auto"
     mask: Path | None = None
+    mesh_up: str = "auto"
+    mesh_open_top: bool = False
 
 
 @dataclass(frozen=True)
@@ -82,7 +85,7 @@ def extract_stage(settings: VideoSettings, folder: Path) -> Stage:
     def work(progress: Progress) -> Mapping[str, Any]:
         from .perceive import ObjectRequest, extract
 
-        requests = [ObjectRequest(o.name, o.box_xywh_px, o.mesh, o.mesh_unit, o.mask) for o in objects]
+        requests = [ObjectRequest(**vars(o)) for o in objects]
         tracks = extract(
             settings.video,
             requests,

@@ -42,6 +42,8 @@ def test_report_reads_everything(tmp_path: Path) -> None:
     [
         {"object": ObjectSettings("kettle", (1, 2, 3, 4))},
         {"object": ObjectSettings("kettle", mesh_unit="mm")},
+        {"object": ObjectSettings("kettle", mesh_up="+y")},
+        {"object": ObjectSettings("kettle", mesh_open_top=True)},
         {"camera": (500.0, 500.0, 320.0, 240.0)},
         {"seed": 1},
         {"start_frame": 3},
