@@ -61,6 +61,36 @@ def load_mesh(path: Path | str, unit: str = "auto", *, max_faces: int | None = 6
     else:
         found, scale = unit, METRES_PER_UNIT[unit]
         check_extent(extent * scale, found, str(path), extent)
+    mesh = _joined(path, vertices, faces, colors, scale, max_faces)
+    mesh.metadata.update(unit=found, unit_source="guessed" if unit == "auto" else "given")
+    return mesh
+
+
+def load_mesh_of_unknown_size(path: Path | str, *, max_faces: int | None = 60_000) -> Any:
+    """Like `load_mesh`, in the file's own unit and of any size: what is stored by its shape alone is read so.
+
+    Raises UserError for a file that is missing, too large, damaged, empty, not finite, or flat to a point.
+    """
+    path = Path(path)
+    vertices, faces, colors = _read(path)
+    if not np.ptp(vertices, axis=0).max() > 0:
+        raise UserError(f"{path} has no extent; export the object's surface again")
+    # Brought to a size at which the tolerances of joining vertices mean something, and back.
+    size = float(np.ptp(vertices, axis=0).max())
+    mesh = _joined(path, vertices, faces, colors, 1 / size, max_faces)
+    mesh.apply_scale(size)
+    return mesh
+
+
+def _joined(
+    path: Path,
+    vertices: Array,
+    faces: np.ndarray[Any, np.dtype[np.int64]],
+    colors: np.ndarray[Any, np.dtype[np.uint8]],
+    scale: float,
+    max_faces: int | None,
+) -> Any:
+    """A scaled trimesh of at most so many faces, its equal vertices joined and its degenerate faces gone."""
     faces_in_file = len(faces)
     if max_faces is not None and faces_in_file > max_faces:
         vertices, faces, colors = _decimated(vertices, faces, colors, max_faces)
@@ -72,12 +102,7 @@ def load_mesh(path: Path | str, unit: str = "auto", *, max_faces: int | None = 6
     mesh.remove_unreferenced_vertices()
     if len(mesh.faces) == 0:
         raise UserError(f"{path} holds only degenerate triangles; export the object's surface again")
-    mesh.metadata.update(
-        name=path.stem,
-        unit=found,
-        unit_source="guessed" if unit == "auto" else "given",
-        faces_in_file=faces_in_file,
-    )
+    mesh.metadata.update(name=path.stem, faces_in_file=faces_in_file)
     return mesh
 
 
@@ -133,9 +158,13 @@ def _read(path: Path) -> tuple[Array, np.ndarray[Any, np.dtype[np.int64]], np.nd
 
         def get(self, name: str) -> bytes:
             target = Path(self.absolute(name))
+            # Google Scanned Objects keep textures in a folder beside the mesh's, which their materials do not say.
+            aside = path.parent.parent / "materials" / "textures" / Path(name).name
+            if not target.is_file() and path.parent.name == "meshes" and aside.is_file():
+                target = aside
             if target.is_file() and target.stat().st_size > MAX_FILE_BYTES:
                 raise ValueError(f"its side file {name} is too large")
-            return cast(bytes, super().get(name))
+            return target.read_bytes() if target == aside else cast(bytes, super().get(name))
 
     try:
         with open(path, "rb") as stream:

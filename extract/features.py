@@ -1,0 +1,175 @@
+"""Features of crops without learned weights: directions of the outline, of inner edges, and the depth inside.
+
+The grid is like a vision transformer's, so that everything above works with either. A cell holds a histogram of the
+directions of the silhouette's edge (the shape), a fainter one of edges inside (handles before the body, rims, spouts),
+the share of the object in it, and how deep inside it lies. Directions count modulo 180 degrees, in the spirit of
+HOG (Dalal and Triggs, 2005): colours of a stored mesh and of a real object seldom agree, their outlines do.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import UserError
+from .protocols import Floats, PatchFeatures, PatchGrid
+
+BINS = 6
+CLASSICAL_CROP_PX, CLASSICAL_GRID = 120, 30
+# Weights of what a cell holds. Measured by bench/retrieval.py.
+OUTLINE, INSIDE, SHARE, DEPTH = 1.0, 0.5, 0.25, 0.25
+INSIDE_SUMMARY = 0.15
+SUMMARY_CELLS = 8
+DEPTH_PX = 10.0
+BLUR_PX = 1.2
+
+
+@dataclass(frozen=True)
+class ClassicalFeatures:
+    """`PatchFeatures` of plain image processing; numbers are small, so it runs at 120 px."""
+
+    name: str = "classical-1"
+    crop_px: int = CLASSICAL_CROP_PX
+    grid: int = CLASSICAL_GRID
+
+    @property
+    def patch_size(self) -> int:
+        return 2 * BINS + 2
+
+    @property
+    def summary_size(self) -> int:
+        return 2 * BINS * SUMMARY_CELLS**2
+
+    def encode(self, crops: NDArray[np.uint8], masks: NDArray[np.bool_]) -> PatchGrid:
+        """Features of crops (B, S, S, 3) and their masks (B, S, S)."""
+        patches = np.empty((len(crops), self.grid, self.grid, self.patch_size), np.float32)
+        summary = np.empty((len(crops), self.summary_size), np.float32)
+        for k, (rgb, mask) in enumerate(zip(crops, masks, strict=True)):
+            patches[k] = _cells(rgb, mask, self.grid)
+            summary[k] = _pooled(patches[k], SUMMARY_CELLS)
+        return PatchGrid(patches, summary)
+
+
+def _cells(rgb: NDArray[np.uint8], mask: NDArray[np.bool_], grid: int) -> Floats:
+    """(G, G, 2 BINS + 2) features of one crop."""
+    inside = mask.astype(np.float32)
+    soft = cv2.GaussianBlur(inside, (0, 0), BLUR_PX)
+    # Blurred over the object alone, so that the black around it makes no edge of its own.
+    lit = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY) * inside
+    grey = cv2.GaussianBlur(lit, (0, 0), BLUR_PX) / np.maximum(soft, 0.05)
+    core = cv2.erode(mask.astype(np.uint8), np.ones((5, 5), np.uint8))
+    depth = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 3)
+    outline = _directions(*_gradient(soft), np.ones(mask.shape, np.float32), grid)
+    gx, gy = _gradient(grey)
+    strength = np.hypot(gx, gy)
+    usual = float(np.percentile(strength[core > 0], 80)) if core.any() else 0.0
+    # Strong edges count no more than twice the usual ones: a label must not drown the shape.
+    weight = core * np.minimum(strength, 2 * usual + 2) / np.maximum(strength, 1e-6) / (usual + 4)
+    inner = _directions(gx, gy, weight.astype(np.float32), grid)
+    share = cv2.resize(inside, (grid, grid), interpolation=cv2.INTER_AREA)
+    deep = cv2.resize(np.tanh(depth / DEPTH_PX), (grid, grid), interpolation=cv2.INTER_AREA)
+    return np.concatenate(
+        [OUTLINE * outline, INSIDE * inner, SHARE * share[..., None], DEPTH * deep[..., None]],
+        axis=-1,
+        dtype=np.float32,
+    )
+
+
+def _gradient(values: NDArray[Any]) -> tuple[Floats, Floats]:
+    return np.asarray(cv2.Sobel(values, -1, 1, 0), np.float32), np.asarray(cv2.Sobel(values, -1, 0, 1), np.float32)
+
+
+def _pooled(cells: Floats, count: int) -> Floats:
+    """Both histograms on a coarser grid, each of unit length, the inner one weighted."""
+    weights = _pooling(cells.shape[0], count)
+    pooled = np.einsum("ui,vj,ijb->uvb", weights, weights, cells[..., : 2 * BINS], optimize=True)
+    outline, inner = pooled[..., :BINS].ravel(), pooled[..., BINS:].ravel()
+    outline = outline / max(float(np.linalg.norm(outline)), 1e-9)
+    inner = INSIDE_SUMMARY * inner / max(float(np.linalg.norm(inner)), 1e-9)
+    return np.concatenate([outline, inner], dtype=np.float32)
+
+
+@functools.lru_cache(maxsize=4)
+def _pooling(size: int, count: int) -> Floats:
+    """(count, size) weights of fine cells in coarse ones: Gaussians as wide as half a coarse cell."""
+    step = size / count
+    gap = (np.arange(size) + 0.5)[None, :] - (np.arange(count) + 0.5)[:, None] * step
+    weights = np.exp(-0.5 * (gap / (0.6 * step)) ** 2)
+    return np.asarray(weights / weights.sum(axis=1, keepdims=True), np.float32)
+
+
+@numba.njit(cache=True, fastmath=True)
+def _directions(gx: Floats, gy: Floats, weight: Floats, grid: int) -> Floats:
+    """(grid, grid, BINS) weighted histograms of the direction of a gradient, shared among near cells and bins."""
+    height, width = gx.shape
+    out = np.zeros((grid, grid, BINS), np.float32)
+    scale = grid / height
+    for y in range(height):
+        v = (y + 0.5) * scale - 0.5
+        r = int(np.floor(v))
+        fv = v - r
+        for x in range(width):
+            strength = np.sqrt(gx[y, x] ** 2 + gy[y, x] ** 2) * weight[y, x]
+            if strength < 1e-4:
+                continue
+            at = np.arctan2(gy[y, x], gx[y, x]) / np.pi * BINS
+            if at < 0:
+                at += BINS
+            b = int(at)
+            fb = at - b
+            b0, b1 = b % BINS, (b + 1) % BINS
+            u = (x + 0.5) * scale - 0.5
+            c = int(np.floor(u))
+            fu = u - c
+            for dr in range(2):
+                for dc in range(2):
+                    row, column = r + dr, c + dc
+                    if 0 <= row < grid and 0 <= column < grid:
+                        share = strength * (fv if dr else 1 - fv) * (fu if dc else 1 - fu)
+                        out[row, column, b0] += share * (1 - fb)
+                        out[row, column, b1] += share * fb
+    return out
+
+
+def object_cells(masks: NDArray[np.bool_], grid: int) -> NDArray[np.bool_]:
+    """(B, G, G) cells of which masks (B, S, S) cover any part, as the paper's resizing by area has it."""
+    count, side = masks.shape[0], masks.shape[1]
+    if side % grid == 0:
+        step = side // grid
+        return np.asarray(masks.reshape(count, grid, step, grid, step).any(axis=(2, 4)))
+    shares = [cv2.resize(mask.astype(np.float32), (grid, grid), interpolation=cv2.INTER_AREA) for mask in masks]
+    return np.asarray(np.stack(shares) > 0)
+
+
+def foreground_average(patches: Floats, cells: NDArray[np.bool_]) -> Floats:
+    """(B, D) mean of features (B, G, G, D) over the object's cells (B, G, G): FFA (Kotar et al., 2023) of each view."""
+    weight = cells.astype(np.float32)
+    total = np.einsum("bijd,bij->bd", patches, weight)
+    return np.asarray(total / np.maximum(weight.sum(axis=(1, 2)), 1.0)[:, None], np.float32)
+
+
+def unit(vectors: Floats) -> Floats:
+    """Vectors (..., D) of unit length; zero stays zero."""
+    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12), np.float32)
+
+
+def make_features(name: str, options: dict[str, str] | None = None) -> PatchFeatures:
+    """The encoder of a name: "classical", or a model that `vid2demo models list` shows.
+
+    options: for models, such as the folder of their weights.
+    Raises UserError for an unknown name and when weights are missing.
+    """
+    if name == "classical":
+        return ClassicalFeatures()
+    raise UserError(f"unknown patch features {name!r}; there is classical")
+
+
+def usual_descriptor(encoder: str) -> str:
+    """The column by which objects are found: "summary" for classical features, the paper's average for networks."""
+    return "summary" if encoder.startswith("classical") else "average"

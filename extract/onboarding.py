@@ -1,0 +1,231 @@
+"""Meshes into the database: read, cleaned, normalised, seen from all sides, described, stored; each once.
+
+Work is by mesh, in processes of their own; what one has written is complete, so that a killed command goes on where it
+was. A mesh that cannot be read is told about and left out.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import math
+import multiprocessing
+import os
+import threading
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from .errors import UserError
+from .features import foreground_average, make_features, object_cells, unit
+from .files import write_json
+from .mesh_sources import MeshSource
+from .mesh_store import About, MeshStore, StoredMesh
+from .meshes import METRES_PER_UNIT, guess_unit, load_mesh_of_unknown_size
+from .progress import Progress
+from .protocols import PatchFeatures
+from .templates import ColoredMesh, ViewSettings, template_view
+from .vessels import make_vessel
+
+MAX_FACES = 20_000
+BATCH = 30
+VERSION = "1"
+
+
+@dataclass
+class Onboarded:
+    """What came of a folder: meshes stored now, those stored before, and (name, reason) of those left out.
+
+    same: names of meshes that another one of the folder equals.
+    """
+
+    stored: list[str] = field(default_factory=list)
+    before: list[str] = field(default_factory=list)
+    same: list[str] = field(default_factory=list)
+    failed: list[tuple[str, str]] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Job:
+    """Everything a worker needs to know; it makes the rest itself."""
+
+    source: MeshSource
+    root: Path
+    settings: ViewSettings
+    encoder: str
+    unit: str
+    options: tuple[tuple[str, str], ...] = ()
+
+
+def read_source(source: MeshSource, unit_name: str = "auto") -> StoredMesh:
+    """A source's mesh, decimated to MAX_FACES, its bounding box centred, its largest half-extent brought to 1.
+
+    unit_name: of the file's numbers; "auto" guesses it, or leaves the size open where no unit makes sense of it.
+    Raises UserError for what cannot be read.
+    """
+    if source.is_of_library:
+        _, category, seed = source.path.split("/")
+        raw = make_vessel(category, int(seed)).mesh
+        found: str | None = "m"
+    else:
+        raw = load_mesh_of_unknown_size(source.path, max_faces=MAX_FACES)
+        found = guess_unit(float(np.max(raw.extents))) if unit_name == "auto" else unit_name
+    vertices, faces = np.asarray(raw.vertices, np.float64), np.asarray(raw.faces, np.int32)
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    centre, half = (low + high) / 2, float((high - low).max() / 2)
+    if not math.isfinite(half) or half <= 0:
+        raise UserError(f"{source.path} has an extent of {2 * half:g}; export the object's surface again")
+    size_m = (high - low) * METRES_PER_UNIT[found] if found else np.zeros(3)
+    about = About(
+        source.name,
+        source.category,
+        source.path,
+        (float(centre[0]), float(centre[1]), float(centre[2])),
+        half,
+        found or "",
+        (float(size_m[0]), float(size_m[1]), float(size_m[2])),
+        int(raw.metadata.get("faces_in_file", len(faces))),
+    )
+    # Rounded as it is stored, so that the key of what is read back is the same.
+    normalised = ((vertices - centre) / half).astype(np.float32).astype(np.float64)
+    return StoredMesh(ColoredMesh(normalised, faces, _colors(raw)), about)
+
+
+def describe_views(store: MeshStore, key: str, mesh: ColoredMesh, features: PatchFeatures) -> None:
+    """Draw and encode all views of a normalised mesh and store what they say."""
+    count, settings = store.settings.count, store.settings
+    average = np.empty((count, features.patch_size), np.float32)
+    summary = np.empty((count, features.summary_size), np.float32)
+    visible = np.empty((count, 2))
+    for first in range(0, count, BATCH):
+        rows = range(first, min(first + BATCH, count))
+        views = [template_view(mesh, settings, index, features.crop_px) for index in rows]
+        masks = np.stack([view.mask for view in views])
+        encoded = features.encode(np.stack([view.rgb for view in views]), masks)
+        at = slice(rows.start, rows.stop)
+        average[at] = unit(foreground_average(encoded.patches, object_cells(masks, features.grid)))
+        summary[at] = unit(encoded.summary)
+        visible[at] = [view.visible for view in views]
+    store.write_views(key, average, summary, visible)
+
+
+def onboard_one(job: Job) -> tuple[str, str]:
+    """Store one mesh and its views unless they are there: ("stored" | "before" | "failed", key or reason)."""
+    features = _features(job.encoder, job.options)
+    store = MeshStore.create(job.root, job.settings, features)
+    try:
+        note = store.source_file(job.source.digest(f"{VERSION} {MAX_FACES} {job.unit}"))
+        key = _noted(note, store)
+        if key is not None and store.has_views(key):
+            return "before", key
+        stored = read_source(job.source, job.unit) if key is None else store.mesh(key)
+        key = store.write_mesh(stored)
+        fresh = not store.has_views(key)
+        if fresh:
+            describe_views(store, key, stored.mesh, features)
+        write_json(note, {"mesh": key, "source": job.source.path})
+        return ("stored" if fresh else "same"), key
+    except (UserError, ValueError, ArithmeticError, MemoryError, OSError) as error:
+        return "failed", str(error)
+
+
+def onboard(
+    sources: Sequence[MeshSource],
+    root: Path | str,
+    *,
+    settings: ViewSettings = ViewSettings(),  # noqa: B008 - frozen
+    encoder: str = "classical",
+    options: tuple[tuple[str, str], ...] = (),
+    unit_name: str = "auto",
+    workers: int = 1,
+    progress: Progress | None = None,
+) -> Onboarded:
+    """Bring meshes into the database at `root`, which is made when missing.
+
+    encoder: a name that `features.make_features` knows, `options` for it.  workers: processes.
+    Raises UserError for a folder that is no database, or that another process writes to.
+    """
+    store = MeshStore.create(root, settings, make_features(encoder, dict(options)))
+    jobs = [Job(source, Path(root).absolute(), settings, encoder, unit_name, options) for source in sources]
+    result = Onboarded()
+    with store.only_writer():
+        seen: set[str] = set()
+        for done, (job, (state, found)) in enumerate(_in_processes(jobs, workers), start=1):
+            name = job.source.name
+            if state == "failed":
+                result.failed.append((name, found))
+            elif found in seen or state == "same":
+                result.same.append(name)
+            else:
+                (result.stored if state == "stored" else result.before).append(name)
+            seen.add(found)
+            if progress is not None:
+                progress(done, len(jobs), name)
+        store.index()
+    return result
+
+
+@functools.lru_cache(maxsize=1)
+def _features(encoder: str, options: tuple[tuple[str, str], ...]) -> PatchFeatures:
+    """A worker's encoder: a network is loaded once, not for every mesh."""
+    return make_features(encoder, dict(options))
+
+
+def _noted(note: Path, store: MeshStore) -> str | None:
+    """The key of the mesh that a file became, when both note and mesh are there."""
+    try:
+        key = str(json.loads(note.read_text("utf-8"))["mesh"])
+    except (OSError, ValueError, KeyError):
+        return None
+    return key if store.has_mesh(key) else None
+
+
+def _colors(mesh: Any) -> np.ndarray[Any, np.dtype[np.uint8]]:
+    """(V, 3) vertex colours; those of faces go to their corners."""
+    if getattr(mesh.visual, "kind", None) == "face":
+        colors = np.zeros((len(mesh.vertices), 3), np.uint8)
+        colors[np.asarray(mesh.faces).ravel()] = np.repeat(np.asarray(mesh.visual.face_colors)[:, :3], 3, axis=0)
+        return colors
+    return np.array(np.asarray(mesh.visual.vertex_colors)[:, :3], np.uint8)
+
+
+def _one_thread() -> None:
+    """Many workers, one thread each; none outlives the command, however it ends."""
+    cv2.setNumThreads(1)
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+
+
+def _end_with(parent: Any) -> None:
+    parent.join()
+    os._exit(1)
+
+
+def _in_processes(jobs: Sequence[Job], workers: int) -> Iterator[tuple[Job, tuple[str, str]]]:
+    if workers <= 1 or len(jobs) <= 1:
+        yield from ((job, onboard_one(job)) for job in jobs)
+        return
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(min(workers, len(jobs)), mp_context=context, initializer=_one_thread) as pool:
+        yield from _as_they_come(jobs, workers, lambda job: pool.submit(onboard_one, job))
+
+
+def _as_they_come(
+    jobs: Iterable[Job], workers: int, submit: Callable[[Job], Any]
+) -> Iterator[tuple[Job, tuple[str, str]]]:
+    """Results as they are ready; no more than a few jobs wait, so that an interruption ends soon."""
+    waiting: dict[Any, Job] = {}
+    rest = iter(jobs)
+    while True:
+        while len(waiting) < 2 * workers and (job := next(rest, None)) is not None:
+            waiting[submit(job)] = job
+        if not waiting:
+            return
+        for future in wait(waiting, return_when=FIRST_COMPLETED).done:
+            yield waiting.pop(future), future.result()
