@@ -13,6 +13,11 @@ from ..extract.progress import Terminal
 
 ReferenceFile = Annotated[Path, arg(metavar="REFERENCE", help="A *.reference.npz, as `retarget` writes it.")]
 
+SolverName = Annotated[
+    Literal["auto", "torque", "mink"],
+    arg(help="Joint motion by optimal torques, or by inverse kinematics alone; auto: torques where installed."),
+]
+
 
 @dataclass(frozen=True, kw_only=True)
 class Retarget(Staged):
@@ -29,6 +34,7 @@ class Retarget(Staged):
         str | None, told("NAME", "Stand this vessel of the library under the lip. Default: what the track shows.")
     ] = None
     scale: Scale = "auto"
+    solver: SolverName = "auto"
     seed: Seed = 0
 
     def do(self) -> Result:
@@ -36,8 +42,8 @@ class Retarget(Staged):
 
         chosen: dict[str, Any] = {"receptacle": self.receptacle, "scale": self.scale, "seed": self.seed}
         first = reference_stage(self.track, self.receptacle_track, self.out, **chosen)
-        second = retarget_stage(reference_path(self.track, self.out), self.out)
-        chosen |= {"track": self.track, "receptacle_track": self.receptacle_track}
+        second = retarget_stage(reference_path(self.track, self.out), self.out, solver=self.solver)
+        chosen |= {"track": self.track, "receptacle_track": self.receptacle_track, "solver": self.solver}
         return self.do_stages([first, second], chosen)
 
 

@@ -46,13 +46,15 @@ def feasibility(reference: Reference, joints: JointTrajectory) -> dict[str, Any]
         "collisions": collisions,
         "scale": reference.scale,
         "time_stretch": float(reference.header.get("time_stretch", 1.0)),
+        "solver": joints.header.get("solver", {}).get("name", "mink"),
         "payload_kg": float(joints.header.get("payload_kg", 0.0)),
         "caught_part_of_jet": reference.header.get("feasibility", {}).get("caught_part_of_jet"),
         "changes": reference.notes,
     }
     problems = _problems(findings, margin, speed_part, torque_part)
     findings["feasible"] = not problems
-    findings["words"] = [*_words(findings, problems), *reference.notes]
+    note = joints.header.get("solver", {}).get("note")
+    findings["words"] = [*_words(findings, problems), *([note] if note else []), *reference.notes]
     return findings
 
 

@@ -1,27 +1,29 @@
-"""From a `Reference` to joint motion: differential inverse kinematics with mink, inside joint and speed limits."""
+"""From a `Reference` to joint motion: inverse kinematics with mink, then torques that carry the object (Eq. 4)."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any, Literal
 
 import mink
-import mujoco
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from ..envs.kinematics import HAND_BODY, limit_margin_rad, panda_chain, pose_error
-from ..envs.panda import DQ_MAX_RAD_S, FINGER_JOINTS, FINGER_MAX_M, Q_MAX_RAD, Q_MIN_RAD, panda_spec
+from ..envs.kinematics import limit_margin_rad, panda_chain
+from ..envs.panda import DQ_MAX_RAD_S, FINGER_JOINTS, FINGER_MAX_M, Q_MAX_RAD, Q_MIN_RAD
 from ..extract.errors import UserError
 from ..extract.geometry import Array
+from . import optimize
+from .dynamics import HELD_BODY, arm_with, contents_of, inverse_dynamics, payload_of
 from .joints import JointTrajectory
+from .limits import commanded, extremes
+from .motion import JointCurve
 
 if TYPE_CHECKING:
     from ..envs.reference import Reference
-    from ..extract.vessels import Vessel
 
 __all__ = ["JointTrajectory", "retarget", "tracking_errors"]
 
-HELD_BODY = "held_vessel"
+Solver = Literal["auto", "torque", "mink"]
 LOST_M, LOST_RAD = 0.03, np.deg2rad(10.0)
 LIMIT_DISTANCE_RAD = 0.01
 # The redundancy stays near the start posture; so weak that it costs less than 0.01 mm of tracking.
@@ -29,51 +31,95 @@ _POSTURE_COST = 1e-3
 _ITERATIONS = 3
 
 
-def retarget(reference: Reference, *, contents_kg: float = 0.0, strict: bool = True) -> JointTrajectory:
+def retarget(
+    reference: Reference,
+    *,
+    contents_kg: float | None = None,
+    strict: bool = True,
+    solver: Solver = "auto",
+    weights: optimize.TorqueWeights | None = None,
+) -> JointTrajectory:
     """Joint motion that carries the held object along the reference, knot by knot on its clock.
 
-    contents_kg: mass of what is in the vessel, at its origin, for the torques. strict: raise UserError where the object
-    would be further than 3 cm or 10 degrees from the reference, instead of returning the nearest motion.
+    contents_kg: mass of what is in the vessel, at its origin, throughout. None: what the environments fill in, and as
+        much of it as has not yet run out.
+    strict: raise UserError where the object would be further than 3 cm or 10 degrees from the reference, instead of
+        returning the nearest motion.
+    solver: "mink" follows by inverse kinematics alone; "torque" solves Eq. 4 from there, and raises UserError when the
+        extra `torque` is not installed; "auto" does so where it is, and says in the header which of the two it was.
     Speeds never exceed the joints' limits: where the reference is too fast for them the motion lags behind it, and the
     errors in the header say by how much (`build_reference` slows such motions down beforehand).
     """
-    model = _model_with_vessel(reference, contents_kg)
-    q_rad = _follow_with_mink(model, reference)
+    filled_kg, left = contents_of(reference) if contents_kg is None else (contents_kg, np.ones(len(reference)))
+    full = payload_of(reference, filled_kg)
+    empty_arm, full_arm = (arm_with(p, reference.T_hand_object) for p in (payload_of(reference), full))
+    q_rad = _follow_with_mink(full_arm, reference)
+    header: dict[str, Any] = {"solver": {"name": "mink"}}
+    if solver == "torque" or (solver == "auto" and optimize.is_available()):
+        q_rad, header["solver"] = _improved(reference, q_rad, full, weights or optimize.TorqueWeights())
+    elif solver == "auto":
+        header["solver"]["note"] = (
+            "Crocoddyl and Pinocchio are not installed, so the motion was found by inverse kinematics alone and its "
+            "torques are not optimized; `pip install 'vid2demo[torque]'` adds that."
+        )
     time_s = reference.time_s - reference.time_s[0]
-    dq_rad_s = np.gradient(q_rad, time_s, axis=0)
+    curve = JointCurve(time_s, q_rad)
+    motion = [curve.at(time_s, order) for order in range(3)]
+    # Torque is linear in the contents' mass, so every fill level lies between the empty and the full vessel.
+    tau_empty, tau_full = (inverse_dynamics(arm, *motion) for arm in (empty_arm, full_arm))
+    tau_nm = tau_empty + left[:, None] * (tau_full - tau_empty)
     position_m, rotation_rad = tracking_errors(reference, q_rad)
     if strict:
         _check_followed(reference, position_m, rotation_rad)
     width_m = float(reference.header.get("grasp", {}).get("width_m", 0.0))
-    header = {
+    header |= {
         "control_hz": reference.control_hz,
         "position_error_m": {"mean": float(position_m.mean()), "max": float(position_m.max())},
         "rotation_error_rad": {"mean": float(rotation_rad.mean()), "max": float(rotation_rad.max())},
         "limit_margin_rad": limit_margin_rad(q_rad).min(axis=0).tolist(),
-        "speed_part": (np.abs(dq_rad_s).max(axis=0) / DQ_MAX_RAD_S).tolist(),
-        "payload_kg": float(model.body_mass[model.body(HELD_BODY).id]),
+        "speed_part": (np.abs(motion[1]).max(axis=0) / DQ_MAX_RAD_S).tolist(),
+        "payload_kg": full.mass_kg,
+        "contents_kg": filled_kg,
     }
-    tau_nm = inverse_dynamics(model, q_rad, dq_rad_s, np.gradient(dq_rad_s, time_s, axis=0))
     gripper_m = np.full(len(time_s), min(0.5 * width_m, FINGER_MAX_M))
-    return JointTrajectory(time_s, q_rad, dq_rad_s, tau_nm, gripper_m, header)
+    return JointTrajectory(time_s, q_rad, motion[1], tau_nm, gripper_m, header)
 
 
 def tracking_errors(reference: Reference, q_rad: Array) -> tuple[Array, Array]:
-    """Distance (N,) in m and angle (N,) in rad between the held object at q (N, 7) and the reference."""
+    """Distance (N,) in m and angle (N,) in rad between the held object at q (N, 7) and the reference.
+
+    A turn that the object's symmetry hides is no error.
+    """
     T = panda_chain().hand(q_rad) @ reference.T_hand_object
-    error = pose_error(T, reference.T_world_object)
-    return np.linalg.norm(error[:, :3], axis=1), np.linalg.norm(error[:, 3:], axis=1)
+    position_m = np.linalg.norm(T[:, :3, 3] - reference.T_world_object[:, :3, 3], axis=1)
+    return position_m, reference.symmetry.error_rad(T[:, :3, :3], reference.T_world_object[:, :3, :3])
 
 
-def inverse_dynamics(model: Any, q_rad: Array, dq_rad_s: Array, ddq_rad_s2: Array) -> Array:
-    """(N, 7) joint torques in N m for a motion (N, 7) without contacts."""
-    data = mujoco.MjData(model)
-    tau_nm = np.empty_like(q_rad)
-    for k in range(len(q_rad)):
-        data.qpos[:7], data.qvel[:7], data.qacc[:7] = q_rad[k], dq_rad_s[k], ddq_rad_s2[k]
-        mujoco.mj_inverse(model, data)
-        tau_nm[k] = data.qfrc_inverse[:7]
-    return tau_nm
+def _improved(
+    reference: Reference, q_warm_rad: Array, payload: Any, weights: optimize.TorqueWeights
+) -> tuple[Array, dict[str, Any]]:
+    """The motion of least cost near a warm start (N, 7), or the warm start where that is the better one."""
+    solved = optimize.optimize(reference, q_warm_rad, payload, weights)
+    told: dict[str, Any] = {
+        "name": "crocoddyl",
+        "iterations": solved.iterations,
+        "converged": solved.converged,
+        "weights": asdict(weights),
+    }
+    before, after = (_faults(reference, q) for q in (q_warm_rad, solved.q_rad))
+    if after <= before:
+        return solved.q_rad, told
+    told |= {"name": "mink", "note": "The optimizer found no motion as good as inverse kinematics, which was kept."}
+    return q_warm_rad, told
+
+
+def _faults(reference: Reference, q_rad: Array) -> tuple[bool, int]:
+    """What makes a motion worse than another, most important first: the object is lost, limits are broken."""
+    position_m, rotation_rad = tracking_errors(reference, q_rad)
+    lost = bool((position_m > LOST_M).any() or (rotation_rad > LOST_RAD).any())
+    curve = JointCurve(reference.time_s - reference.time_s[0], q_rad)
+    path = commanded(curve.at(curve.clock(1000.0)), np.zeros((2, 7)))
+    return lost, sum(extreme.broken for extreme in extremes(path))
 
 
 def _check_followed(reference: Reference, position_m: Array, rotation_rad: Array) -> None:
@@ -85,31 +131,6 @@ def _check_followed(reference: Reference, position_m: Array, rotation_rad: Array
             f"{position_m.max():.2f} m and {np.rad2deg(rotation_rad.max()):.0f} degrees; place it anew or choose a "
             "smaller --scale"
         )
-
-
-def _model_with_vessel(reference: Reference, contents_kg: float) -> Any:
-    """The arm with the vessel's mass in its hand; no contacts, no gravity compensation: torques are the motors'."""
-    spec = panda_spec(visuals=False)
-    spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
-    for body in spec.bodies:
-        body.gravcomp = 0.0
-    T = reference.T_hand_object
-    x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat()
-    held = spec.body(HAND_BODY).add_body(name=HELD_BODY, pos=T[:3, 3], quat=[w, x, y, z])
-    held.explicitinertial = True
-    vessel = reference.vessel() if reference.header.get("vessel") else None
-    held.mass, held.ipos, held.inertia = _inertia(vessel, contents_kg)
-    return spec.compile()
-
-
-def _inertia(vessel: Vessel | None, contents_kg: float) -> tuple[float, Array, Array]:
-    """Mass, centre and principal inertia. A box's inertia stands for the vessel's, a small part of the arm's."""
-    if vessel is None:
-        return max(contents_kg, 1e-3), np.zeros(3), np.full(3, 1e-6)
-    mass = float(vessel.mass_kg) + contents_kg
-    center = np.asarray(vessel.mesh.center_mass) * float(vessel.mass_kg) / mass
-    a, b, c = (float(e) for e in vessel.extents_m)
-    return mass, center, mass / 8.0 * np.array([b * b + c * c, a * a + c * c, a * a + b * b])
 
 
 class KnotSpeedLimit(mink.Limit):

@@ -63,9 +63,13 @@ def reference_stage(
     )
 
 
-def retarget_stage(reference: Path, folder: Path) -> Stage:
-    """NAME.reference.npz -> NAME.joints.npz and feasibility.json."""
+def retarget_stage(reference: Path, folder: Path, *, solver: Literal["auto", "torque", "mink"] = "auto") -> Stage:
+    """NAME.reference.npz -> NAME.joints.npz and feasibility.json. solver: see `retarget.retarget`."""
+    from .optimize import is_available
+
     output = joints_path(reference, folder)
+    # What "auto" means changes with what is installed, and then the stage is to be done again.
+    chosen = ("torque" if is_available() else "mink") if solver == "auto" else solver
 
     def work(progress: Progress) -> Mapping[str, Any]:
         from ..envs.reference import Reference
@@ -73,18 +77,18 @@ def retarget_stage(reference: Path, folder: Path) -> Stage:
         from .retarget import retarget
 
         wanted = Reference.load(reference)
-        joints = retarget(wanted)
+        joints = retarget(wanted, solver=solver)
         joints.save(output)
         findings = plain(feasibility(wanted, joints))
         write_json(folder / "feasibility.json", findings)
-        shown = ("feasible", "position_error_m", "rotation_error_rad", "words")
+        shown = ("feasible", "solver", "position_error_m", "rotation_error_rad", "words")
         return {name: findings[name] for name in shown if name in findings}
 
     return Stage(
         "retarget",
         "find the joint motion",
         work,
-        {},
+        {"solver": chosen},
         {"reference": reference},
         (output.name, "feasibility.json"),
         ROOMS,

@@ -109,7 +109,7 @@ def solve_ik(
     """Damped least squares from q (M, 7) to hand poses (M, 4, 4), inside the joint limits less `margin_rad`.
 
     The redundancy is spent on drawing near `q_rest_rad` ((7,) or (M, 7); the initial q if None).
-    It ends early when no error, in m or rad, is above `until`. Returns q (M, 7) and the remaining error (M, 6) [m, rad].
+    It ends early when no error, in m or rad, is above `until`. Returns q (M, 7) and the errors left (M, 6) [m, rad].
     """
     chain = panda_chain()
     q = np.clip(q_init_rad, Q_MIN_RAD + margin_rad, Q_MAX_RAD - margin_rad)

@@ -28,11 +28,18 @@ PADS = ("panda_leftfinger_pad", "panda_rightfinger_pad")
 LINKS = (*(f"panda_link{i}" for i in range(8)), "panda_hand", "panda_leftfinger", "panda_rightfinger")
 TCP_SITE = "tcp"
 
-# Limits of the URDF; a test holds them against the compiled model.
+# Limits of the joints, in one place. Position, speed and torque are the URDF's (a test holds them against the compiled
+# model) and the datasheet's; acceleration, jerk and rate of torque are the datasheet's alone: Franka Control Interface
+# documentation, "Robot and interface specifications", limits for the Panda in joint space.
 Q_MIN_RAD: Array = np.array([-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973])
 Q_MAX_RAD: Array = np.array([2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973])
 DQ_MAX_RAD_S: Array = np.array([2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 2.61])
 TAU_MAX_NM: Array = np.array([87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0])
+DDQ_MAX_RAD_S2: Array = np.array([15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0])
+DDDQ_MAX_RAD_S3: Array = np.array([7500.0, 3750.0, 5000.0, 6250.0, 7500.0, 10000.0, 10000.0])
+DTAU_MAX_NM_S = 1000.0
+# What the hand may carry, fingers not counted.
+PAYLOAD_MAX_KG = 3.0
 Q_HOME_RAD: Array = np.array([0.0, -0.785398, 0.0, -2.35619, 0.0, 1.5707, 0.785398])
 FINGER_MAX_M = 0.04
 # What the Franka Hand can press with for as long as one likes, and the stiffness of its servos here.
@@ -93,8 +100,7 @@ def panda_spec(visuals: bool = True, actuation: Literal["servo", "torque"] = "se
         as libfranka does. The fingers are position servos in m either way.
     Joint torques, gravity compensation included, are limited to the URDF's efforts.
     """
-    root = _description_folder()
-    spec = mujoco.MjSpec.from_file(str(root / "urdf" / "panda.urdf"))
+    spec = mujoco.MjSpec.from_file(str(urdf_path()))
     spec.modelname = "panda"
     # Without this, hand and tcp would melt into link 7 and their names would be gone.
     spec.compiler.fusestatic = False
@@ -156,6 +162,11 @@ def _add_servo(spec: mujoco.MjSpec, joint: str, stiffness: float, damping: float
     actuator.gainprm[0] = stiffness
     actuator.biasprm[:3] = (0.0, -stiffness, -damping)
     return actuator
+
+
+def urdf_path() -> Path:
+    """The Panda's description, of which every model of it here is made. Raises UserError when it is missing."""
+    return _description_folder() / "urdf" / "panda.urdf"
 
 
 def _description_folder() -> Path:

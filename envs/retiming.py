@@ -7,13 +7,11 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 
 from ..extract.geometry import Array
-from .panda import DQ_MAX_RAD_S
+from .panda import DDQ_MAX_RAD_S2, DQ_MAX_RAD_S
 from .reference import Reference
 
 # Part of the joint limits that a reference may ask for: the rest is for the controller.
 SPEED_PART, ACCELERATION_PART = 0.8, 0.8
-# The Panda's datasheet.
-DDQ_MAX_RAD_S2: Array = np.array([15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0])
 # So long before and after a fast moment the clock slows down and recovers, so that no joint jerks.
 _EASE_S = 0.12
 _ROUNDS = 6

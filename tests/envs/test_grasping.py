@@ -6,10 +6,10 @@ from vid2demo.envs.collision import CollisionChecker
 from vid2demo.envs.grasps import MAX_WIDTH_M, grasp_candidates
 from vid2demo.envs.jet import filling_m3, jet_of
 from vid2demo.envs.kinematics import panda_chain
-from vid2demo.envs.panda import Q_HOME_RAD
+from vid2demo.envs.panda import DDQ_MAX_RAD_S2, Q_HOME_RAD
 from vid2demo.envs.receptacle import surface_points
 from vid2demo.envs.reference import Reference, minimum_jerk
-from vid2demo.envs.retiming import DDQ_MAX_RAD_S2, slowed
+from vid2demo.envs.retiming import slowed
 from vid2demo.envs.vessel_geometry import gripper_half_width_m
 from vid2demo.extract.geometry import Array, make_pose, transform_points
 from vid2demo.extract.vessels import CATEGORIES, Vessel, make_vessel
