@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
+from .bop_commands import SynthesizeBop
 from .command import Box, Category, Command, Commands, MeshUnit, Receiver, Result, Seed, Staged, told
 
 if TYPE_CHECKING:
@@ -178,4 +179,5 @@ COMMANDS: Commands = {
     "meshes show": MeshesShow,
     "meshes export": MeshesExport,
     "synthesize": Synthesize,
+    "synthesize bop": SynthesizeBop,
 }

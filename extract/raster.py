@@ -32,12 +32,18 @@ class DepthWindow:
 
     def mask_in_image(self, width_px: int, height_px: int) -> NDArray[np.bool_]:
         """The silhouette cut to the image, (height, width) bool."""
-        full = np.zeros((height_px, width_px), bool)
+        return np.asarray(self.depth_in_image(width_px, height_px) > 0)
+
+    def depth_in_image(self, width_px: int, height_px: int) -> NDArray[np.float32]:
+        """The depth in m cut to the image, (height, width) float32, 0 where nothing was hit."""
+        full = np.zeros((height_px, width_px), np.float32)
         h, w = self.depth_m.shape
         x_a, y_a = max(self.x0_px, 0), max(self.y0_px, 0)
         x_b, y_b = min(self.x0_px + w, width_px), min(self.y0_px + h, height_px)
         if x_a < x_b and y_a < y_b:
-            full[y_a:y_b, x_a:x_b] = self.mask[y_a - self.y0_px : y_b - self.y0_px, x_a - self.x0_px : x_b - self.x0_px]
+            full[y_a:y_b, x_a:x_b] = self.depth_m[
+                y_a - self.y0_px : y_b - self.y0_px, x_a - self.x0_px : x_b - self.x0_px
+            ]
         return full
 
 

@@ -24,10 +24,11 @@ from .progress import Progress
 from .synthetic_hand import Grip, grips
 from .synthetic_motion import Camera, PourPath, PourShape, place_camera, plan_pour
 from .synthetic_scene import OBJECT, RECEPTACLE, Scene
+from .synthetic_studio import Sensor
 from .track import ObjectTrack
 from .vessel_types import Vessel
 from .vessels import make_vessel, resolve_category
-from .video import Image, VideoWriter, read_video_info
+from .video import VideoWriter, read_video_info
 
 SCHEMA = "vid2demo/synthetic-clip"
 VISIBLE_FRACTION = 0.1
@@ -94,7 +95,7 @@ def synthesize(
     )
     path = plan_pour(rng, shape, seconds, fps)
     camera, height_share = place_camera(rng, path, shape, size)
-    sensor = _Sensor(rng, size) if noise else None
+    sensor = Sensor(rng, size) if noise else None
     video, count = out / "video.mp4", len(path.time_s)
     visible = np.zeros(count)
     boxes: dict[str, list[int] | None] = {}
@@ -262,25 +263,3 @@ def _box_of(mask: NDArray[np.bool_]) -> list[int] | None:
     if len(rows) == 0:
         return None
     return [int(columns[0]), int(rows[0]), int(columns[-1] - columns[0] + 1), int(rows[-1] - rows[0] + 1)]
-
-
-class _Sensor:
-    """A small camera: lens blur, vignette, white balance, exposure flicker, shot and read noise."""
-
-    def __init__(self, rng: np.random.Generator, size_px: tuple[int, int]) -> None:
-        width, height = size_px
-        y, x = np.mgrid[-1 : 1 : height * 1j, -1 : 1 : width * 1j]
-        vignette = 1 - rng.uniform(0.03, 0.15) * (x * x + y * y) / 2
-        balance = rng.uniform(0.94, 1.06, 3) * rng.uniform(0.95, 1.12)
-        self._gain = (vignette[..., None] * balance).astype(np.float32)
-        self._blur_px = rng.uniform(0.4, 0.9) * max(height / 480, 0.5)
-        self._read, self._shot = rng.uniform(0.8, 1.8), rng.uniform(0.08, 0.2)
-        self._flicker = rng.uniform(0.0, 0.008)
-
-    def expose(self, picture: Image, rng: np.random.Generator) -> Image:
-        """One noisy frame of a clean picture (H, W, 3)."""
-        light = np.asarray(cv2.GaussianBlur(picture, (0, 0), self._blur_px), np.float32)
-        light *= self._gain * np.float32(1 + self._flicker * rng.standard_normal())
-        sigma = self._read + self._shot * np.sqrt(np.maximum(light, 0))
-        light += sigma * rng.standard_normal(light.shape, dtype=np.float32)
-        return np.asarray(np.clip(np.rint(light), 0, 255), np.uint8)
