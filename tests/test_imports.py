@@ -162,7 +162,8 @@ def test_everything_imported_is_a_requirement() -> None:
 
     extras = project["optional-dependencies"]
     # An adapter for another project's users asks for that project's package in its own error.
-    base, dev = names([*project["dependencies"], *extras["dm"], *extras["rerun"]]), names(extras["dev"])
+    own = [r for extra in ("dm", "models", "rerun") for r in extras[extra]]
+    base, dev = names([*project["dependencies"], *own]), names(extras["dev"])
     brought = {"torch", "torchvision", "pandas", "pyarrow", "datasets", "huggingface-hub"}
     above = names([r for extra, rs in extras.items() if extra != "dev" for r in rs]) | brought
     # rerun-sdk adds its own folder to the path, where its metadata does not say that the module lies.
