@@ -13,6 +13,7 @@ from ..extract.progress import Terminal
 
 ReferenceFile = Annotated[Path, arg(metavar="REFERENCE", help="A *.reference.npz, as `retarget` writes it.")]
 
+JointsFile = Annotated[Path, arg(metavar="JOINTS", help="A *.joints.npz, as `retarget` writes it.")]
 SolverName = Annotated[
     Literal["auto", "torque", "mink"],
     arg(help="Joint motion by optimal torques, or by inverse kinematics alone; auto: torques where installed."),
@@ -145,8 +146,58 @@ class Replay(Command):
         return 0 if result["same_end"] == result["episodes"] else 1
 
 
+@dataclass(frozen=True, kw_only=True)
+class ExportTrajectory(Command):
+    """Write a joint motion for a real arm: commands at 1 kHz as CSV, or a ROS JointTrajectory as JSON.
+
+    What the Panda's datasheet forbids is not written; the error names joint, time, value and limit.
+
+    For example: vid2demo export-trajectory runs/coffee/kettle.joints.npz --format ros
+    """
+
+    joints: Positional[JointsFile]
+    format: Annotated[Literal["csv", "ros"], arg(help="csv: 1 kHz rows of time, q, dq, tau, gripper; ros: JSON.")] = (
+        "csv"
+    )
+    out: Annotated[
+        Path | None, told("FILE", "The file to write. Default: beside JOINTS, its name with the format's.")
+    ] = None
+
+    def do(self) -> Result:
+        from .check_trajectory import export_file
+
+        return export_file(self.joints, self.format, self.out)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CheckTrajectory(Command):
+    """Check that a Panda would take a trajectory: position, speed, acceleration, jerk, torque and their continuity.
+
+    Takes what `export-trajectory` writes, or a *.joints.npz. The exit status is 1 when a limit is broken.
+
+    For example: vid2demo check-trajectory runs/coffee/kettle.csv
+    """
+
+    file: Positional[Annotated[Path, arg(metavar="FILE", help="A .csv or .json of `export-trajectory`, or joints.")]]
+
+    def do(self) -> Result:
+        from .check_trajectory import check_file
+
+        return check_file(self.file)
+
+    def words(self, result: Result) -> str:
+        from .check_trajectory import as_text
+
+        return as_text(result)
+
+    def status(self, result: Result) -> int:
+        return 0 if result["ok"] else 1
+
+
 COMMANDS: Commands = {
     "retarget": Retarget,
+    "export-trajectory": ExportTrajectory,
+    "check-trajectory": CheckTrajectory,
     "simulate": Simulate,
     "play": Play,
     "collect": Collect,
