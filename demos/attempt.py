@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from ..envs.diverged import PhysicsError
 from ..envs.panda import ARM_JOINTS
-from ..envs.pouring import PhysicsError
 from ..extract.errors import UserError
 from ..extract.files import write_json
 from .dataset import DatasetLayout

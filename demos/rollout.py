@@ -13,6 +13,7 @@ from .camera_encoder import CameraEncoder
 from .episode import Episode
 
 if TYPE_CHECKING:
+    from ..envs.reference import Reference
     from .retarget import JointTrajectory
 
 DEFAULT_ENV_ID = "vid2demo:PandaPour-v0"
@@ -78,7 +79,7 @@ def joint_actions(joints: JointTrajectory, env: Any) -> NDArray[np.float32]:
     return actions
 
 
-def make_env(env_id: str, reference: Path | str | None, **kwargs: Any) -> Any:
+def make_env(env_id: str, reference: Reference | Path | str | None, **kwargs: Any) -> Any:
     """`gym.make` without the passive checker, whose warnings are for people who write environments."""
     import gymnasium
 

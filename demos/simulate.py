@@ -16,8 +16,9 @@ from ..extract.geometry import Array, angle_between_rad
 from ..extract.stages import Progress
 from ..extract.video import VideoWriter, iterate_frames
 from .attempt import FIXED_ENV_KWARGS
+from .impedance import ImpedancePlayer
 from .joints import JointTrajectory
-from .rollout import DEFAULT_ENV_ID, ActionPlayer, Info, Observation, control_rate, joint_actions, make_env, roll_out
+from .rollout import DEFAULT_ENV_ID, Info, Observation, control_rate, make_env, roll_out
 
 Image = NDArray[np.uint8]
 PANEL_HEIGHT_PX = 480
@@ -38,7 +39,7 @@ def simulate(
     env_kwargs: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Play joint targets open loop in the environment and film it beside the video.
+    """Play a joint motion in the environment, closed over the object's pose, and film it beside the video.
 
     Every frame shows the robot at time t and the video at the moment that the reference's knot at t was taken from,
     so the two stay together where the motion was slowed down. Without a video the robot stands alone.
@@ -60,7 +61,7 @@ def simulate(
     try:
         with VideoWriter(Path(out_mp4), fps=control_rate(env)) as writer:
             recorder.open(writer, _on_clock(Path(video), reference.video_time_s) if video is not None else None)
-            episode = roll_out(env, ActionPlayer(joint_actions(joints, env)), seed=seed, on_step=recorder)
+            episode = roll_out(env, ImpedancePlayer(joints), seed=seed, on_step=recorder)
     finally:
         env.close()
     series = recorder.series()
