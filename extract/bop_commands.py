@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from pathlib import Path
+from typing import Annotated, Literal
 
-from tyro.conf import arg
+from tyro.conf import Positional, arg
 
-from .command import Result, Seed, Staged
+from .command import Command, Result, Seed, Staged, told
+from .progress import Terminal
+
+DatasetFolder = Annotated[Path, arg(metavar="DATASET", help="A data set in BOP's format, models and pictures.")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,3 +38,36 @@ class SynthesizeBop(Staged):
             f"{self.scenes} scenes with {counts['targets']['targets']} targets of {counts['models']['models']} models, "
             f"{counts['database']['meshes']} other meshes of their categories in database.json\nwritten to {self.out}"
         )
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvalBop(Command):
+    """Judge a results file: average recalls of CoU, CH and pCH as in the paper, and the error of the scale.
+
+    For example: vid2demo eval-bop ycbv results.csv --json
+    """
+
+    dataset: Positional[DatasetFolder]
+    results: Positional[Annotated[Path, arg(metavar="RESULTS.csv", help="Poses in BOP's format; see the README.")]]
+    protocol: Annotated[Literal["official", "paper"], arg(help="The authors' code or the paper's text.")] = "official"
+    split: Annotated[str | None, told("NAME", "Folder of the pictures. Default: test, val or train.")] = None
+    meshes: Annotated[Path | None, told("DIR", "Where the results' meshes lie. Default: beside the results.")] = None
+
+    def do(self) -> Result:
+        from .bop_eval import evaluate_files
+
+        with Terminal() as terminal:
+            scores = evaluate_files(
+                self.dataset,
+                self.results,
+                split=self.split,
+                protocol=self.protocol,
+                meshes=self.meshes,
+                progress=terminal.progress,
+            )
+        return scores.to_json()
+
+    def words(self, result: Result) -> str:
+        from .bop_eval import Scores
+
+        return Scores.from_json(result).table()

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from .bop_commands import SynthesizeBop
+from .bop_commands import EvalBop, SynthesizeBop
 from .command import Box, Category, Command, Commands, MeshUnit, Receiver, Result, Seed, Staged, told
 
 if TYPE_CHECKING:
@@ -180,4 +180,5 @@ COMMANDS: Commands = {
     "meshes export": MeshesExport,
     "synthesize": Synthesize,
     "synthesize bop": SynthesizeBop,
+    "eval-bop": EvalBop,
 }

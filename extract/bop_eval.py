@@ -1,0 +1,252 @@
+"""Judging a results file against a data set: average recalls of CoU, CH and pCH, scale error, and what else applies."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .bop import Dataset, ImageKey, TrueObject, open_dataset
+from .bop_results import Estimate, read_results
+from .errors import UserError
+from .geometry import Array
+from .metrics import AUC_LIMIT_M, area_under_recall, point_distances
+from .pose_metrics import METRICS, Placed, Protocol, Shape, pose_error, recalls
+from .progress import Progress
+from .symmetry import estimate_symmetry
+
+SAME_OBJECT_IOU = 0.25  # of silhouettes, from which on an estimate is taken to mean a true object
+_POINTS = 1000
+
+
+@dataclass(frozen=True)
+class Scores:
+    """What a results file is worth.
+
+    ar_*: average recalls in percent, `ar` the mean of the three. recall: metric -> ten recalls in percent, at
+    `pose_metrics.limits`. targets, estimates, images: how many. The further ones are medians over the targets that an
+    estimate clearly means, `matched` of them: scale_error_percent of the largest extent; and where the estimate is of
+    the data set's own model, adds_m and rotation_deg (up to symmetry), with the share of ADD-S up to 10 cm in percent.
+    """
+
+    protocol: str
+    ar: float
+    ar_cou: float
+    ar_ch: float
+    ar_pch: float
+    targets: int
+    estimates: int
+    images: int
+    matched: int
+    scale_error_percent: float | None
+    adds_m: float | None = None
+    adds_auc_percent: float | None = None
+    rotation_deg: float | None = None
+    seconds_per_image: float | None = None
+    recall: dict[str, list[float]] = field(default_factory=dict)
+
+    def to_json(self) -> dict[str, Any]:
+        return asdict(self)
+
+    @staticmethod
+    def from_json(value: Mapping[str, Any]) -> Scores:
+        return Scores(**value)
+
+    def table(self) -> str:
+        """The figures for a person."""
+        lines = [
+            f"{self.targets} targets in {self.images} images, {self.estimates} estimates, protocol {self.protocol}",
+            "recall [%] at the limits  " + "".join(f"{n:>7}" for n in range(1, 11)) + "   average",
+        ]
+        titles = {"cou": "CoU (0.05 ... 0.5)", "ch": "CH (0.05 ... 0.5 d)", "pch": "pCH (5 ... 50 px)"}
+        for metric, title in titles.items():
+            shares = self.recall[metric]
+            lines.append(f"{title:<26}" + "".join(f"{v:7.1f}" for v in shares) + f"{sum(shares) / len(shares):10.2f}")
+        lines.append(f"{'AR':<26}{self.ar:80.2f}")
+        further = {
+            "median scale error [%]": self.scale_error_percent,
+            "median ADD-S [m]": self.adds_m,
+            "ADD-S AUC to 10 cm [%]": self.adds_auc_percent,
+            "median rotation error [deg]": self.rotation_deg,
+            "time [s/image]": self.seconds_per_image,
+        }
+        lines += [f"{title}: {value:.4g}" for title, value in further.items() if value is not None]
+        return "\n".join([*lines, f"{self.matched} targets are clearly meant by an estimate"])
+
+
+def evaluate_files(
+    dataset: Path, results: Path, *, split: str | None, protocol: Protocol, meshes: Path | None, progress: Progress
+) -> Scores:
+    """`evaluate` on files. meshes: folder in which the results' meshes lie, if not beside the results."""
+    return evaluate(
+        open_dataset(dataset, split),
+        read_results(results),
+        protocol=protocol,
+        folders=(*([meshes] if meshes else []), results.parent, dataset),
+        progress=progress,
+    )
+
+
+def evaluate(
+    dataset: Dataset,
+    estimates: Sequence[Estimate],
+    *,
+    protocol: Protocol = "official",
+    folders: Sequence[Path] = (Path(),),
+    progress: Progress | None = None,
+) -> Scores:
+    """Judge estimates against a data set's targets. folders: where the estimates' mesh files may lie.
+
+    Raises UserError when an estimate is of a picture that the data set does not have, or its mesh is not found.
+    """
+    if strangers := {e.image for e in estimates} - set(dataset.images):
+        first = min(strangers)
+        raise UserError(
+            f"the results tell of scene {first.scene_id}, image {first.im_id}, which {dataset.root} does not have; "
+            "name the data set or the split that they are of"
+        )
+    wanted = targets_of(dataset)
+    by_image: dict[ImageKey, list[Estimate]] = defaultdict(list)
+    for estimate in estimates:
+        by_image[estimate.image].append(estimate)
+    shape = _shapes(dataset, tuple(folders))
+    found = {metric: np.zeros(10, np.int64) for metric in METRICS}
+    pairs: list[tuple[Estimate, TrueObject]] = []
+    for done, (image, truths) in enumerate(sorted(wanted.items()), start=1):
+        camera, size_px = dataset.camera_matrix(image), dataset.size_px(image)
+        true = [Placed(shape(t.obj_id, None, None), t.T_camera_object, camera, size_px, protocol) for t in truths]
+        of_image = by_image[image]
+        placed = [
+            Placed(shape(e.obj_id, e.mesh, e.size_m), e.T_camera_object, camera, size_px, protocol) for e in of_image
+        ]
+        scores = np.array([e.score for e in of_image])
+        for metric in METRICS:
+            errors = np.full((len(placed), len(true)), np.inf)
+            for k, one in enumerate(placed):
+                for n, other in enumerate(true):
+                    if _may_mean(of_image[k], truths[n], protocol):
+                        errors[k, n] = pose_error(metric, one, other, dataset.models[truths[n].obj_id].diameter_m)
+            found[metric] += recalls(errors, metric, protocol, scores)
+            if metric == "cou":
+                pairs += [(of_image[k], truths[n]) for n, k in _meant(errors)]
+        if progress is not None:
+            progress(done, len(wanted), "judging")
+    count = sum(map(len, wanted.values()))
+    recall = {metric: (100 * found[metric] / max(count, 1)).tolist() for metric in METRICS}
+    average = {metric: float(np.mean(recall[metric])) for metric in METRICS}
+    times = {e.image: e.time_s for e in estimates if e.time_s is not None}
+    return Scores(
+        protocol,
+        float(np.mean(list(average.values()))),
+        average["cou"],
+        average["ch"],
+        average["pch"],
+        count,
+        len(estimates),
+        len(wanted),
+        len(pairs),
+        _median([100 * abs(_size(e, shape) / shape(t.obj_id, None, None).size_m - 1) for e, t in pairs]),
+        **_of_own_models([(e, t) for e, t in pairs if e.mesh is None and e.obj_id == t.obj_id], dataset),
+        seconds_per_image=float(np.mean(list(times.values()))) if times else None,
+        recall=recall,
+    )
+
+
+def targets_of(dataset: Dataset) -> dict[ImageKey, list[TrueObject]]:
+    """The true objects to be found in each picture: of each target's object the most visible ones, as many as asked."""
+    wanted: dict[ImageKey, list[TrueObject]] = defaultdict(list)
+    for target in dataset.targets:
+        there = [t for t in dataset.objects(target.image) if t.obj_id == target.obj_id]
+        there.sort(key=lambda t: -(1.0 if t.visible_fraction is None else t.visible_fraction))
+        wanted[target.image] += there[: target.count]
+    return dict(wanted)
+
+
+def find_mesh(name: str, folders: Sequence[Path]) -> Any:
+    """The trimesh.Trimesh that a results file names: "library:CATEGORY:SEED", or a file, in one of the folders.
+
+    Its unit does not matter, for the results give its size. Raises UserError when there is no such mesh.
+    """
+    if name.startswith("library:"):
+        from .vessels import make_vessel
+
+        _, _, rest = name.partition(":")
+        category, _, seed = rest.partition(":")
+        if seed and not seed.isdecimal():
+            raise UserError(f"the results name the mesh {name!r}; give library:CATEGORY:SEED with a whole number")
+        return make_vessel(category, int(seed) if seed else None).mesh
+    for folder in folders:
+        if (path := folder / name).is_file():
+            import trimesh
+
+            return trimesh.load(path, force="mesh")
+    raise UserError(
+        f"the results name the mesh {name!r}, which is in none of {', '.join(map(str, folders))}; name its --meshes"
+    )
+
+
+def _shapes(dataset: Dataset, folders: tuple[Path, ...]) -> Callable[[int, str | None, float | None], Shape]:
+    @cache
+    def unsized(name: str) -> Any:
+        return find_mesh(name, folders)
+
+    @cache
+    def shape(obj_id: int, mesh: str | None, size_m: float | None) -> Shape:
+        if mesh is not None:
+            return Shape.of(unsized(mesh), size_m)
+        if obj_id not in dataset.models:
+            raise UserError(f"the results tell of object {obj_id}, of which {dataset.root} has no model")
+        return Shape.of(dataset.mesh(obj_id))
+
+    # The object id says nothing of another mesh, and would only spoil the cache.
+    return lambda obj_id, mesh, size_m: shape(0 if mesh is not None else obj_id, mesh, size_m)
+
+
+def _may_mean(estimate: Estimate, truth: TrueObject, protocol: Protocol) -> bool:
+    """The paper's protocol keeps to the object that an estimate names; the official one tries all on all."""
+    return protocol == "official" or estimate.mesh is not None or estimate.obj_id == truth.obj_id
+
+
+def _meant(errors: Array) -> list[tuple[int, int]]:
+    """(truth, estimate) where the estimate covers the truth best, and well enough to mean it."""
+    if errors.size == 0:
+        return []
+    best = np.argmin(errors, axis=0)
+    return [(n, int(k)) for n, k in enumerate(best) if errors[k, n] <= 1 - SAME_OBJECT_IOU]
+
+
+def _size(estimate: Estimate, shape: Callable[[int, str | None, float | None], Shape]) -> float:
+    return estimate.size_m if estimate.size_m is not None else shape(estimate.obj_id, None, None).size_m
+
+
+def _of_own_models(pairs: Sequence[tuple[Estimate, TrueObject]], dataset: Dataset) -> dict[str, float | None]:
+    """ADD-S and geodesic errors, which need the same mesh on both sides."""
+    if not pairs:
+        return {}
+    symmetry = {obj_id: estimate_symmetry(dataset.mesh(obj_id)) for obj_id in {t.obj_id for _, t in pairs}}
+    points = {obj_id: _some_points(dataset.mesh(obj_id)) for obj_id in symmetry}
+    adds_m, rotation_rad = [], []
+    for estimate, truth in pairs:
+        T, T_true = estimate.T_camera_object[None], truth.T_camera_object[None]
+        adds_m.append(float(point_distances(T, T_true, points[truth.obj_id])[1][0]))
+        rotation_rad.append(float(symmetry[truth.obj_id].error_rad(T[:, :3, :3], T_true[:, :3, :3])[0]))
+    return {
+        "adds_m": _median(adds_m),
+        "adds_auc_percent": area_under_recall(np.array(adds_m), AUC_LIMIT_M),
+        "rotation_deg": float(np.rad2deg(np.median(rotation_rad))),
+    }
+
+
+def _some_points(mesh: Any) -> Array:
+    import trimesh
+
+    return np.asarray(trimesh.sample.sample_surface(mesh, _POINTS, seed=0)[0], float)
+
+
+def _median(values: Sequence[float]) -> float | None:
+    return float(np.median(values)) if len(values) else None
