@@ -56,7 +56,8 @@ class ImpedancePlayer:
         self._correct(min(self._step, last), np.asarray(observation["agent_pos"][:7], float))
         self._step += 1
         target = self._targets[min(self._step, len(self._targets) - 1)] + self._correction_rad
-        return np.clip(target, self._space.low, self._space.high).astype(np.float32)
+        inside: NDArray[np.float32] = np.clip(target, self._space.low, self._space.high).astype(np.float32)
+        return inside
 
     def _correct(self, knot: int, q_rad: Array) -> None:
         T, wanted = self._env.T_world_object, self._reference.T_world_object[knot]
