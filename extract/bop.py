@@ -19,6 +19,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import PIL.Image
 from numpy.typing import NDArray
 
 from .errors import UserError
@@ -120,9 +121,13 @@ class Dataset:
         return self._numbers(self._entry(image, "camera"), "cam_K", 9, self._place(image)).reshape(3, 3)
 
     def size_px(self, image: ImageKey) -> tuple[int, int]:
-        """(width, height) of the picture."""
-        height, width = self.rgb(image).shape[:2]
-        return width, height
+        """(width, height) of the picture, from its file's first bytes."""
+        path = self.rgb_path(image)
+        try:
+            with PIL.Image.open(path) as picture:
+                return picture.size
+        except OSError as error:
+            raise UserError(f"{path} cannot be read as a picture") from error
 
     def objects(self, image: ImageKey) -> tuple[TrueObject, ...]:
         """The true objects of a picture; none where it is not annotated."""
@@ -170,7 +175,7 @@ class Dataset:
         path = self._models_folder / f"obj_{obj_id:06d}.ply"
         if not path.is_file():
             raise UserError(f"{path} is missing; the data set's models belong there")
-        return load_mesh(path, "mm")
+        return load_mesh(path, "mm", max_faces=None)
 
     @cached_property
     def targets(self) -> tuple[Target, ...]:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .bop import Dataset, ImageKey, TrueObject, open_dataset
 from .bop_results import Estimate, read_results
@@ -125,12 +126,12 @@ def evaluate(
             Placed(shape(e.obj_id, e.mesh, e.size_m), e.T_camera_object, camera, size_px, protocol) for e in of_image
         ]
         scores = np.array([e.score for e in of_image])
+        allowed = np.array([[_may_mean(e, t, protocol) for t in truths] for e in of_image], bool)
+        diameters_m = [dataset.models[t.obj_id].diameter_m for t in truths]
+        order = None
         for metric in METRICS:
-            errors = np.full((len(placed), len(true)), np.inf)
-            for k, one in enumerate(placed):
-                for n, other in enumerate(true):
-                    if _may_mean(of_image[k], truths[n], protocol):
-                        errors[k, n] = pose_error(metric, one, other, dataset.models[truths[n].obj_id].diameter_m)
+            errors = _errors(metric, placed, true, diameters_m, allowed.reshape(len(placed), len(true)), order)
+            order = np.argsort(errors, axis=0) if metric == "cou" else order
             found[metric] += recalls(errors, metric, protocol, scores)
             if metric == "cou":
                 pairs += [(of_image[k], truths[n]) for n, k in _meant(errors)]
@@ -210,6 +211,26 @@ def _shapes(dataset: Dataset, folders: tuple[Path, ...]) -> Callable[[int, str |
 def _may_mean(estimate: Estimate, truth: TrueObject, protocol: Protocol) -> bool:
     """The paper's protocol keeps to the object that an estimate names; the official one tries all on all."""
     return protocol == "official" or estimate.mesh is not None or estimate.obj_id == truth.obj_id
+
+
+def _errors(
+    metric: str,
+    placed: Sequence[Placed],
+    true: Sequence[Placed],
+    diameters_m: Sequence[float],
+    allowed: NDArray[np.bool_],
+    order: NDArray[np.int64] | None,
+) -> Array:
+    """Errors (E, T) of estimates of true objects. order: (E, T) which estimates to try first on each object."""
+    errors = np.full(allowed.shape, np.inf)
+    for n, truth in enumerate(true):
+        enough = np.inf
+        for k in range(len(placed)) if order is None else order[:, n]:
+            if allowed[k, n]:
+                errors[k, n] = pose_error(metric, placed[k], truth, diameters_m[n], enough)
+                if truth.protocol == "official":  # of which only the best estimate of each object counts
+                    enough = min(enough, errors[k, n])
+    return errors
 
 
 def _meant(errors: Array) -> list[tuple[int, int]]:

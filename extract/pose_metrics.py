@@ -164,24 +164,24 @@ def chamfer(a: Cloud, b: Cloud, *, squared: bool, limit: float = np.inf) -> floa
     return total
 
 
-def pose_error(metric: str, estimate: Placed, truth: Placed, diameter_m: float) -> float:
+def pose_error(metric: str, estimate: Placed, truth: Placed, diameter_m: float, enough: float = np.inf) -> float:
     """One of the three errors; CH in diameters of the true model, pCH in px of a picture 640 px wide.
 
-    In the paper's protocol CH and pCH are squared. Infinite where it is above the largest limit.
+    In the paper's protocol CH and pCH are squared. CH and pCH are infinite where they are above the largest limit, or
+    above `enough`: whoever only wants the best of several gives the best so far.
     """
     squared = truth.protocol == "paper"
     if metric == "cou":
         return complement_over_union(estimate, truth)
+    if metric not in METRICS:
+        raise UserError(f"unknown metric {metric!r}; there are {', '.join(METRICS)}")
+    limit = min(float(limits(metric, truth.protocol)[-1]), enough)
     if metric == "ch":
         unit = diameter_m**2 if squared else diameter_m
-        limit = limits(metric, truth.protocol)[-1] * unit
-        return chamfer(estimate.cloud, truth.cloud, squared=squared, limit=limit) / unit
-    if metric == "pch":
-        if estimate.flat_cloud is None or truth.flat_cloud is None:
-            return np.inf
-        limit = limits(metric, truth.protocol)[-1]
-        return chamfer(estimate.flat_cloud, truth.flat_cloud, squared=squared, limit=limit)
-    raise UserError(f"unknown metric {metric!r}; there are {', '.join(METRICS)}")
+        return chamfer(estimate.cloud, truth.cloud, squared=squared, limit=limit * unit) / unit
+    if estimate.flat_cloud is None or truth.flat_cloud is None:
+        return np.inf
+    return chamfer(estimate.flat_cloud, truth.flat_cloud, squared=squared, limit=limit)
 
 
 def limits(metric: str, protocol: Protocol) -> Array:
