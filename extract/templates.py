@@ -100,14 +100,35 @@ def crop_matrix(square: tuple[float, float, float], crop_px: int) -> Array:
     return np.array([[scale, 0, (0.5 - left) * scale - 0.5], [0, scale, (0.5 - top) * scale - 0.5], [0.0, 0.0, 1.0]])
 
 
+def turned_box(mask: Mask, turn_rad: float) -> tuple[Array, Box]:
+    """A turn of the picture about the middle of a mask's box, (3, 3), and the box of the mask turned so."""
+    rows, columns = np.nonzero(mask)
+    pixels = np.column_stack([columns, rows, np.ones(len(rows))]).astype(np.float64)
+    x, y = (pixels.min(axis=0) + pixels.max(axis=0))[:2] / 2
+    c, s = np.cos(turn_rad), np.sin(turn_rad)
+    turn = np.array([[c, -s, x - c * x + s * y], [s, c, y - s * x - c * y], [0.0, 0.0, 1.0]])
+    low, high = ((turned := pixels @ turn.T).min(axis=0), turned.max(axis=0))
+    return turn, (float(low[0]), float(low[1]), float(high[0] - low[0] + 1), float(high[1] - low[1] + 1))
+
+
 def crop_picture(
-    rgb: Image, mask: Mask, box_xywh_px: Box, extend: float, crop_px: int, *, masked: bool = True
+    rgb: Image,
+    mask: Mask,
+    box_xywh_px: Box,
+    extend: float,
+    crop_px: int,
+    *,
+    turn: Array | None = None,
+    masked: bool = True,
 ) -> tuple[Image, Mask]:
-    """Square crops (S, S, 3) and (S, S) of a picture and a mask; black beyond the picture and, if masked, the mask."""
+    """Square crops (S, S, 3) and (S, S) of a picture and a mask; black beyond the picture and, if masked, the mask.
+
+    turn: (3, 3) of the picture before it is cropped; the box is then one of the turned picture.
+    """
     square = square_around(box_xywh_px, extend)
     shrink = max(1, round(square[2] / crop_px / 1.5))
     size = crop_px * shrink
-    warp = crop_matrix(square, size)[:2]
+    warp = (crop_matrix(square, size) @ (np.eye(3) if turn is None else turn))[:2]
     shown = np.where(mask[..., None], rgb, 0).astype(np.uint8) if masked else rgb
     picture = cv2.warpAffine(shown, warp, (size, size), flags=cv2.INTER_LINEAR)
     share = cv2.warpAffine(mask.astype(np.uint8) * 255, warp, (size, size), flags=cv2.INTER_LINEAR)
