@@ -71,3 +71,41 @@ class EvalBop(Command):
         from .bop_eval import Scores
 
         return Scores.from_json(result).table()
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchTable(Command):
+    """Print one of the paper's tables: its own figures, and beside them what results files give.
+
+    A row is named by its key and filled from a BOP csv, proposals or track errors; rows without say what fills them.
+
+    For example: vid2demo bench table --name main --dataset ycbv --results megapose=megapose.csv classical=ours.csv
+    """
+
+    name: Annotated[
+        Literal["main", "retrieval", "views", "scale", "proposals", "video"], arg(help="Which of the paper's tables.")
+    ]
+    results: Annotated[tuple[str, ...], told("ROW=FILE", "What fills a row, several for one row too.")] = ()
+    dataset: Annotated[Path | None, told("DATASET", "What the results are of, in BOP's format.")] = None
+    split: Annotated[str | None, told("NAME", "Folder of its pictures. Default: test, val or train.")] = None
+    meshes: Annotated[Path | None, told("DIR", "Where the results' meshes lie. Default: beside the results.")] = None
+    protocol: Annotated[Literal["official", "paper"], arg(help="The authors' code or the paper's text.")] = "official"
+
+    def do(self) -> Result:
+        from .tables import fill_table
+
+        with Terminal() as terminal:
+            return fill_table(
+                self.name,
+                self.results,
+                dataset=self.dataset,
+                split=self.split,
+                protocol=self.protocol,
+                meshes=self.meshes,
+                progress=terminal.progress,
+            )
+
+    def words(self, result: Result) -> str:
+        from .tables import as_text
+
+        return as_text(result)

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from .bop_commands import EvalBop, SynthesizeBop
+from .bop_commands import BenchTable, EvalBop, SynthesizeBop
 from .command import Box, Category, Command, Commands, MeshUnit, Receiver, Result, Seed, Staged, told
+from .models_commands import COMMANDS as MODELS_COMMANDS
 
 if TYPE_CHECKING:
     from .steps import VideoSettings
@@ -181,4 +182,6 @@ COMMANDS: Commands = {
     "synthesize": Synthesize,
     "synthesize bop": SynthesizeBop,
     "eval-bop": EvalBop,
+    "bench table": BenchTable,
+    **MODELS_COMMANDS,
 }
