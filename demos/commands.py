@@ -35,13 +35,19 @@ class Retarget(Staged):
         str | None, told("NAME", "Stand this vessel of the library under the lip. Default: what the track shows.")
     ] = None
     scale: Scale = "auto"
+    speed: Annotated[float, arg(metavar="FLOAT", help="Robot's speed over the video's, at most [ratio].")] = 1.0
     solver: SolverName = "auto"
     seed: Seed = 0
 
     def do(self) -> Result:
         from .steps import reference_path, reference_stage, retarget_stage
 
-        chosen: dict[str, Any] = {"receptacle": self.receptacle, "scale": self.scale, "seed": self.seed}
+        chosen: dict[str, Any] = {
+            "receptacle": self.receptacle,
+            "scale": self.scale,
+            "speed": self.speed,
+            "seed": self.seed,
+        }
         first = reference_stage(self.track, self.receptacle_track, self.out, **chosen)
         second = retarget_stage(reference_path(self.track, self.out), self.out, solver=self.solver)
         chosen |= {"track": self.track, "receptacle_track": self.receptacle_track, "solver": self.solver}

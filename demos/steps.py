@@ -31,9 +31,13 @@ def reference_stage(
     *,
     receptacle: str | None = None,
     scale: float | Literal["auto"] = "auto",
+    speed: float = 1.0,
     seed: int = 0,
 ) -> Stage:
-    """NAME.track.npz (and the receptacle's) -> NAME.reference.npz. receptacle: a library vessel to stand there."""
+    """NAME.track.npz (and the receptacle's) -> NAME.reference.npz. receptacle: a library vessel to stand there.
+
+    speed: of the motion over the video's.
+    """
     output = reference_path(track, folder)
 
     def work(progress: Progress) -> Mapping[str, Any]:
@@ -43,7 +47,9 @@ def reference_stage(
 
         vessel = make_vessel(resolve_category(receptacle)[0]) if receptacle else None
         seen = ObjectTrack.load(receptacle_track) if receptacle_track else None
-        reference = build_reference(ObjectTrack.load(track), seen, scale=scale, receptacle=vessel, seed=seed)
+        reference = build_reference(
+            ObjectTrack.load(track), seen, scale=scale, speed=speed, receptacle=vessel, seed=seed
+        )
         reference.save(output)
         return {
             "knots": len(reference),
@@ -56,7 +62,7 @@ def reference_stage(
         "reference",
         "place the motion in the robot's workspace",
         work,
-        {"scale": scale, "seed": seed, "receptacle": receptacle},
+        {"scale": scale, "speed": speed, "seed": seed, "receptacle": receptacle},
         {"track": track} | ({"receptacle track": receptacle_track} if receptacle_track else {}),
         (output.name,),
         ("extract", "envs"),

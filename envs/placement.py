@@ -21,7 +21,7 @@ from .placement_search import Placement, Shortfall, Stage, search_placement
 from .receptacle import bottom_m, place_receptacle, receptacle_pose_at_pour, surface_points
 from .reference import Reference, vessel_from_header, vessel_to_header
 from .resampling import ResampledTrack, resample_track
-from .retiming import slowed
+from .retiming import at_speed, slowed
 
 if TYPE_CHECKING:
     from ..extract.vessels import Vessel
@@ -56,6 +56,7 @@ def build_reference(
     scale: float | Literal["auto"] = "auto",
     elevation_deg: float = 30.0,
     gravity_tolerance_deg: float = 35.0,
+    speed: float = 1.0,
     vessel: Vessel | None = None,
     receptacle: Vessel | None = None,
     seed: int = 0,
@@ -72,6 +73,8 @@ def build_reference(
         raise UserError(f"the scale is {scale}; give a number in (0, 3] or 'auto'")
     if not -90.0 <= elevation_deg <= 90.0:
         raise UserError(f"the camera's elevation is {elevation_deg} degrees; give one from -90 to 90")
+    if not 0.05 <= speed <= 5.0:
+        raise UserError(f"the speed is {speed}; give a number from 0.05 to 5, where 1 is the video's")
     held = vessel or vessel_from_header(track.header.get("mesh", {}), "held vessel")
     target = receptacle or _receptacle_of(receptacle_track)
     track = _in_vessel_frame(track.from_first_camera(), held)
@@ -126,6 +129,7 @@ def build_reference(
             "control_hz": control_hz,
             "elevation_deg": elevation_deg,
             "gravity_tolerance_deg": gravity_tolerance_deg,
+            "speed": speed,
             "seed": seed,
         },
         "notes": notes,
@@ -143,7 +147,7 @@ def build_reference(
         },
     }
     reference = Reference.from_poses(T_world_object, stage.time_s, header, resampled.confidence, resampled.video_time_s)
-    return slowed(reference, placement.q_rad)
+    return slowed(*at_speed(reference, placement.q_rad, speed))
 
 
 def _receptacle_of(track: ObjectTrack | None) -> Vessel:
@@ -173,20 +177,14 @@ def _upright(
 ) -> _Seen:
     """Turn the camera's frame so that z is up, by the prior elevation and, where it can be trusted, the first poses."""
     T = resampled.T_camera_object
-    R_up_camera = camera_rotation(elevation_deg)
-    axis = still_axis(T, resampled.video_time_s)
-    off_rad = float(angle_between_rad(R_up_camera @ axis, np.array([0.0, 0.0, 1.0])))
-    if np.rad2deg(off_rad) <= tolerance_deg:
-        R_up_camera = _least_rotation(R_up_camera @ axis) @ R_up_camera
-        notes.append(
-            f"The vessel stands upright at first, so the camera looks down by "
-            f"{round(camera_elevation_deg(R_up_camera))} degrees (assumed: {elevation_deg:.0f})."
-        )
-    else:
-        notes.append(
-            f"The vessel's first poses lean by {np.rad2deg(off_rad):.0f} degrees under the assumed camera elevation of "
-            f"{elevation_deg:.0f} degrees; they are taken as they are. Give the elevation if the vessel stood upright."
-        )
+    R_assumed = camera_rotation(elevation_deg)
+    R_up_camera, says = _up_from(
+        still_axis(T, resampled.video_time_s),
+        None if receptacle_track is None else still_axis(receptacle_track.T_camera_object, receptacle_track.time_s),
+        R_assumed,
+        tolerance_deg,
+    )
+    notes.append(says.format(is_deg=camera_elevation_deg(R_up_camera), assumed_deg=elevation_deg))
     up_camera = make_pose(R_up_camera)
     T_object = up_camera @ T
     if vessel.symmetry.order == 0:
@@ -199,6 +197,46 @@ def _upright(
         T_receptacle = up_camera @ receptacle_pose_at_pour(receptacle_track, pouring_s)
     deepest = int(np.argmax(tilt_rad(T_object)))
     return _Seen(T_object, R_up_camera, T_receptacle, T_object[deepest, :3, 3])
+
+
+def _up_from(axis: Array, receptacle_axis: Array | None, R_assumed: Array, tolerance_deg: float) -> tuple[Array, str]:
+    """(3, 3) R_up_camera from the axes (3,), in the camera, of what stands; and a sentence about it to fill in.
+
+    Raises UserError when the vessel hangs upside down and nothing tells that it was the camera.
+    """
+    up = np.array([0.0, 0.0, 1.0])
+
+    # The same camera, turned about its line of sight.
+    R_turned_over = R_assumed @ np.diag([-1.0, -1.0, 1.0])
+
+    def off_deg(value: Array, R_up_camera: Array = R_assumed) -> float:
+        return float(np.rad2deg(angle_between_rad(R_up_camera @ value, up)))
+
+    if off_deg(axis) <= tolerance_deg:
+        says = (
+            "The vessel stands upright at first, so the camera looks down by {is_deg:.0f} degrees "
+            "(assumed: {assumed_deg:.0f})."
+        )
+        return _least_rotation(R_assumed @ axis) @ R_assumed, says
+    if off_deg(axis, R_turned_over) <= tolerance_deg:
+        if receptacle_axis is None or off_deg(receptacle_axis, R_turned_over) > tolerance_deg:
+            raise UserError(
+                "the vessel stands on its head in its first poses: if the camera was upside down, turn the video by "
+                "180 degrees; if not, the tracker took top for bottom: extract it again, with a --box around it"
+            )
+        says = "Vessel and receptacle stand on their heads, so the camera was upside down: the motion was turned over."
+        return _least_rotation(R_turned_over @ axis) @ R_turned_over, says
+    if receptacle_axis is not None and off_deg(receptacle_axis) <= tolerance_deg:
+        says = (
+            "The vessel leans at first, but the receptacle stands upright, so the camera looks down by {is_deg:.0f} "
+            "degrees (assumed: {assumed_deg:.0f})."
+        )
+        return _least_rotation(R_assumed @ receptacle_axis) @ R_assumed, says
+    says = (
+        f"The vessel's first poses lean by {off_deg(axis):.0f} degrees under the assumed camera elevation of "
+        "{assumed_deg:.0f} degrees; they are taken as they are. Give the elevation if the vessel stood upright."
+    )
+    return R_assumed, says
 
 
 def camera_rotation(elevation_deg: float) -> Array:

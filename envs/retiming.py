@@ -17,6 +17,18 @@ _EASE_S = 0.12
 _ROUNDS = 6
 
 
+def at_speed(reference: Reference, q_rad: Array, speed: float) -> tuple[Reference, Array]:
+    """The reference and its joint motion (N, 7), played `speed` times as fast on knots of the same rate."""
+    if speed == 1.0:
+        return reference, q_rad
+    time_s = np.arange(len(reference)) / reference.control_hz
+    knots = max(2, round(reference.duration_s / speed * reference.control_hz) + 1)
+    at_s = np.linspace(0.0, time_s[-1], knots)
+    note = f"The motion is played at {speed:g} times the video's speed, as asked."
+    played = reference.retimed(at_s)
+    return played.with_header(notes=[*played.notes, note]), np.asarray(CubicSpline(time_s, q_rad)(at_s))
+
+
 def slowed(reference: Reference, q_rad: Array) -> Reference:
     """The reference on a clock on which the joint motion q (N, 7) that follows it keeps to its limits.
 
