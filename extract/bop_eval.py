@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cache
@@ -127,12 +127,15 @@ def evaluate(
         ]
         scores = np.array([e.score for e in of_image])
         allowed = np.array([[_may_mean(e, t, protocol) for t in truths] for e in of_image], bool)
+        allowed = allowed.reshape(len(placed), len(true))
         diameters_m = [dataset.models[t.obj_id].diameter_m for t in truths]
+        counts = Counter(t.obj_id for t in truths)
+        only_best = [protocol == "official" and counts[t.obj_id] == 1 for t in truths]
         order = None
         for metric in METRICS:
-            errors = _errors(metric, placed, true, diameters_m, allowed.reshape(len(placed), len(true)), order)
+            errors = _errors(metric, placed, true, diameters_m, allowed, order, only_best)
             order = np.argsort(errors, axis=0) if metric == "cou" else order
-            found[metric] += recalls(errors, metric, protocol, scores)
+            found[metric] += recalls(errors, metric, protocol, scores, [t.obj_id for t in truths])
             if metric == "cou":
                 pairs += [(of_image[k], truths[n]) for n, k in _meant(errors)]
         if progress is not None:
@@ -220,15 +223,19 @@ def _errors(
     diameters_m: Sequence[float],
     allowed: NDArray[np.bool_],
     order: NDArray[np.int64] | None,
+    only_best: Sequence[bool],
 ) -> Array:
-    """Errors (E, T) of estimates of true objects. order: (E, T) which estimates to try first on each object."""
+    """Errors (E, T) of estimates of true objects.
+
+    order: (E, T) which estimates to try first on each object; only_best: of which objects only the least error counts.
+    """
     errors = np.full(allowed.shape, np.inf)
     for n, truth in enumerate(true):
         enough = np.inf
         for k in range(len(placed)) if order is None else order[:, n]:
             if allowed[k, n]:
                 errors[k, n] = pose_error(metric, placed[k], truth, diameters_m[n], enough)
-                if truth.protocol == "official":  # of which only the best estimate of each object counts
+                if only_best[n]:
                     enough = min(enough, errors[k, n])
     return errors
 

@@ -4,6 +4,9 @@ The columns are scene_id, im_id, obj_id, score, R (nine numbers, row by row), t 
 for the picture, -1 if unknown). Two more may follow, for poses of other meshes than the data set's own: `mesh`,
 "library:CATEGORY:SEED" or the path of a mesh file, and `size_m`, its largest full extent. Such a pose is of the mesh
 moved so that the centre of its bounding box is the origin, and scaled to that size.
+
+The files of the paper's authors are read too: their `obj_id` names a mesh, which is `ID/ID.obj` of their folder of
+meshes, and `scale` is half of its largest extent in metres.
 """
 
 from __future__ import annotations
@@ -71,6 +74,7 @@ def read_results(path: Path | str) -> list[Estimate]:
     header = [name.strip() for name in next(reader, [])]
     if missing := [name for name in COLUMNS if name not in header]:
         raise UserError(f"{path}, line 1: columns {', '.join(missing)} are missing; BOP's are {', '.join(COLUMNS)}")
+    by_authors = "scale" in header and "mesh" not in header
     estimates = []
     for row in reader:
         if not any(cell.strip() for cell in row):
@@ -78,7 +82,8 @@ def read_results(path: Path | str) -> list[Estimate]:
         where = f"{path}, line {reader.line_num}"
         if len(row) != len(header):
             raise UserError(f"{where} has {len(row)} columns, the first line {len(header)}")
-        estimates.append(_estimate(dict(zip(header, map(str.strip, row), strict=True)), where))
+        cells = dict(zip(header, map(str.strip, row), strict=True))
+        estimates.append(_estimate(_of_authors(cells, where) if by_authors else cells, where))
     return estimates
 
 
@@ -102,6 +107,12 @@ def _estimate(cells: dict[str, str], where: str) -> Estimate:
         mesh,
         size_m,
     )
+
+
+def _of_authors(cells: dict[str, str], where: str) -> dict[str, str]:
+    """A line of the authors' in this module's columns."""
+    size_m = 2 * float(_numbers(cells, "scale", 1, where)[0])
+    return {**cells, "obj_id": "0", "mesh": "{0}/{0}.obj".format(cells["obj_id"]), "size_m": repr(size_m)}
 
 
 def _whole(cells: dict[str, str], name: str, where: str) -> int:

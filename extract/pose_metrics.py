@@ -9,6 +9,7 @@ distances, between points sampled on the surfaces, compared with squared limits,
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal, get_args
@@ -189,26 +190,24 @@ def limits(metric: str, protocol: Protocol) -> Array:
     return LIMITS[metric] ** 2 if protocol == "paper" and metric != "cou" else LIMITS[metric]
 
 
-def recalls(errors: Array, metric: str, protocol: Protocol, scores: Array | None = None) -> NDArray[np.int64]:
+def recalls(errors: Array, metric: str, protocol: Protocol, scores: Array, obj_ids: Sequence[int]) -> NDArray[np.int64]:
     """(10,) how many true objects are found at each limit, from errors (E, T) of E estimates of T true objects.
 
-    In the official protocol every estimate is tried on every object, and spurious ones cost nothing. In the paper's,
-    which follows the BOP benchmark, each serves one object: the surest estimates choose first (`scores` (E,)), the
-    nearest of the objects that are left.
+    The surest estimates choose first (`scores` (E,)), each the nearest object that is left, and serves that one alone.
+    The official code does so for each kind of object by itself (`obj_ids`, T of them), and offers it all estimates: one
+    may find several objects of different kinds, and spurious ones cost nothing.
     """
-    if errors.size == 0:
-        return np.zeros(10, np.int64)
-    bounds = limits(metric, protocol)
-    if protocol == "official":
-        return np.asarray((errors.min(axis=0)[:, None] < bounds).sum(axis=0), np.int64)
-    order = np.arange(len(errors)) if scores is None else np.argsort(-scores, kind="stable")
-    found = np.zeros(len(bounds), np.int64)
-    for n, bound in enumerate(bounds):
-        left = np.ones(errors.shape[1], bool)
-        for k in order:
-            candidates = np.where(left & (errors[k] < bound), errors[k], np.inf)
-            best = int(np.argmin(candidates))
-            if candidates[best] < np.inf:
-                left[best] = False
-                found[n] += 1
+    found = np.zeros(10, np.int64)
+    ids = np.zeros(len(obj_ids), int) if protocol == "paper" else np.asarray(obj_ids)
+    order = np.argsort(-scores, kind="stable")
+    for n, limit in enumerate(limits(metric, protocol)):
+        for kind in np.unique(ids):
+            of_kind = errors[:, ids == kind]
+            left = np.ones(of_kind.shape[1], bool)
+            for k in order:
+                candidates = np.where(left & (of_kind[k] < limit), of_kind[k], np.inf)
+                best = int(np.argmin(candidates))
+                if candidates[best] < np.inf:
+                    left[best] = False
+            found[n] += np.count_nonzero(~left)
     return found

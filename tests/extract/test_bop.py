@@ -212,6 +212,18 @@ def test_missing_columns_and_files_are_named(tmp_path: Path) -> None:
         read_results(path)
 
 
+def test_the_authors_own_files_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "freepose.csv"
+    line = "3,7,0a1b,0.5,1 0 0 0 1 0 0 0 1,10 -20 800,4 5 30 40,0.06,-1"
+    path.write_text(f"scene_id,im_id,obj_id,score,R,t,bbox_visib,scale,time\n{line}\n")
+    (estimate,) = read_results(path)
+    assert (estimate.mesh, estimate.size_m, estimate.obj_id) == ("0a1b/0a1b.obj", 0.12, 0)
+    assert np.allclose(estimate.T_camera_object, make_pose(t=(0.01, -0.02, 0.8)))
+    path.write_text(path.read_text().replace("0.06", "half"))
+    with pytest.raises(UserError, match="line 2: scale is 'half'"):
+        read_results(path)
+
+
 def test_diameter_is_the_largest_distance() -> None:
     points = np.random.default_rng(2).normal(size=(300, 3))
     assert diameter(points) == pytest.approx(pdist(points).max())

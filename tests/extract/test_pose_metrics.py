@@ -136,25 +136,48 @@ def test_limits_are_the_paper_s() -> None:
     assert limits("cou", "paper") == pytest.approx(limits("cou", "official"))
 
 
-def test_officially_one_estimate_may_find_several_objects_and_in_the_paper_one() -> None:
-    errors = np.array([[0.01, 0.02], [0.9, 0.9]])
-    assert recalls(errors, "cou", "official")[0] == 2
-    assert recalls(errors, "cou", "paper", np.array([1.0, 0.5]))[0] == 1
+def test_officially_one_estimate_may_find_several_kinds_of_objects_and_in_the_paper_one() -> None:
+    errors, scores = np.array([[0.01, 0.02], [0.9, 0.9]]), np.array([1.0, 0.5])
+    assert recalls(errors, "cou", "official", scores, (3, 4))[0] == 2
+    assert recalls(errors, "cou", "official", scores, (3, 3))[0] == 1
+    assert recalls(errors, "cou", "paper", scores, (3, 4))[0] == 1
 
 
 def test_the_surest_estimate_chooses_the_nearest_object_first() -> None:
     errors = np.array([[0.30, 0.20], [np.inf, 0.10]])
     # The surest takes object 1, which the other needs; at a limit of 0.25 nothing is left for it.
-    assert recalls(errors, "cou", "paper", np.array([0.9, 0.8]))[4] == 1
+    assert recalls(errors, "cou", "paper", np.array([0.9, 0.8]), (1, 2))[4] == 1
     # The other way round both are found once the limit admits 0.30.
-    assert list(recalls(errors, "cou", "paper", np.array([0.8, 0.9]))) == [0, 0, 1, 1, 1, 1, 2, 2, 2, 2]
+    assert list(recalls(errors, "cou", "paper", np.array([0.8, 0.9]), (1, 2))) == [0, 0, 1, 1, 1, 1, 2, 2, 2, 2]
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 def test_errors_must_be_below_the_limit(protocol: str) -> None:
     errors = np.array([[LIMITS["cou"][1]]])
-    assert list(recalls(errors, "cou", protocol)) == [0, 0] + [1] * 8  # type: ignore[arg-type]
-    assert recalls(np.zeros((0, 3)), "cou", protocol).sum() == 0  # type: ignore[arg-type]
+    assert list(recalls(errors, "cou", protocol, np.ones(1), (1,))) == [0, 0] + [1] * 8  # type: ignore[arg-type]
+    assert recalls(np.zeros((0, 3)), "cou", protocol, np.ones(0), (1, 2, 3)).sum() == 0  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_recalls_are_those_of_the_benchmark_s_matching(seed: int) -> None:
+    """Written out as the benchmark describes it: estimate by estimate, object by object."""
+    rng = np.random.default_rng(seed)
+    count, truths = int(rng.integers(1, 8)), int(rng.integers(1, 6))
+    errors, scores, ids = rng.random((count, truths)), rng.random(count), rng.integers(0, 3, truths)
+    for protocol in PROTOCOLS:
+        expected = []
+        for limit in limits("cou", "official"):
+            found = 0
+            for kind in set(ids.tolist()) if protocol == "official" else {None}:
+                taken: set[int] = set()
+                for k in sorted(range(count), key=lambda k: -scores[k]):
+                    free = [n for n in range(truths) if (kind is None or ids[n] == kind) and n not in taken]
+                    free = [n for n in free if errors[k, n] < limit]
+                    if free:
+                        taken.add(min(free, key=lambda n: errors[k, n]))
+                found += len(taken)
+            expected.append(found)
+        assert list(recalls(errors, "cou", protocol, scores, ids.tolist())) == expected  # type: ignore[arg-type]
 
 
 def test_unknown_names_are_refused() -> None:
