@@ -166,8 +166,8 @@ def test_everything_imported_is_a_requirement() -> None:
     base, dev = names([*project["dependencies"], *own]), names(extras["dev"])
     brought = {"torch", "torchvision", "pandas", "pyarrow", "datasets", "huggingface-hub"}
     above = names([r for extra, rs in extras.items() if extra != "dev" for r in rs]) | brought
-    # rerun-sdk adds its own folder to the path, where its metadata does not say that the module lies.
-    distributions = {"rerun": ["rerun-sdk"], **importlib.metadata.packages_distributions()}
+    # rerun-sdk and pin add their own folders to the path, where their metadata do not say that the modules lie.
+    distributions = {"rerun": ["rerun-sdk"], "pinocchio": ["pin"], **importlib.metadata.packages_distributions()}
     for top, modules in outside_imports(ROOT).items():
         sources = {d.lower().replace("_", "-") for d in distributions.get(top, [top])}
         allowed = base if any(level(module) < 2 for module in modules) else base | above
