@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .bop import Dataset, ImageKey, TrueObject, open_dataset
+from .bop import Dataset, ImageKey, TrueObject, open_dataset, read_json
 from .bop_results import Estimate, read_results
 from .errors import UserError
 from .geometry import Array
@@ -22,6 +22,7 @@ from .progress import Progress
 from .symmetry import estimate_symmetry
 
 SAME_OBJECT_IOU = 0.25  # of silhouettes, from which on an estimate is taken to mean a true object
+CATEGORIES_FILE, DATABASE_FILE = "categories.json", "database.json"
 _POINTS = 1000
 
 
@@ -33,6 +34,8 @@ class Scores:
     `pose_metrics.limits`. targets, estimates, images: how many. The further ones are medians over the targets that an
     estimate clearly means, `matched` of them: scale_error_percent of the largest extent; and where the estimate is of
     the data set's own model, adds_m and rotation_deg (up to symmetry), with the share of ADD-S up to 10 cm in percent.
+    category_percent: in how many of them the mesh is of the right category, where the data set tells (`categories.json`
+    and `database.json`, as `synthesize bop` writes them).
     """
 
     protocol: str
@@ -48,6 +51,7 @@ class Scores:
     adds_m: float | None = None
     adds_auc_percent: float | None = None
     rotation_deg: float | None = None
+    category_percent: float | None = None
     seconds_per_image: float | None = None
     recall: dict[str, list[float]] = field(default_factory=dict)
 
@@ -74,6 +78,7 @@ class Scores:
             "median ADD-S [m]": self.adds_m,
             "ADD-S AUC to 10 cm [%]": self.adds_auc_percent,
             "median rotation error [deg]": self.rotation_deg,
+            "meshes of the right category [%]": self.category_percent,
             "time [s/image]": self.seconds_per_image,
         }
         lines += [f"{title}: {value:.4g}" for title, value in further.items() if value is not None]
@@ -156,6 +161,7 @@ def evaluate(
         len(pairs),
         _median([100 * abs(_size(e, shape) / shape(t.obj_id, None, None).size_m - 1) for e, t in pairs]),
         **_of_own_models([(e, t) for e, t in pairs if e.mesh is None and e.obj_id == t.obj_id], dataset),
+        category_percent=_right_category(pairs, dataset.root),
         seconds_per_image=float(np.mean(list(times.values()))) if times else None,
         recall=recall,
     )
@@ -268,6 +274,20 @@ def _of_own_models(pairs: Sequence[tuple[Estimate, TrueObject]], dataset: Datase
         "adds_auc_percent": area_under_recall(np.array(adds_m), AUC_LIMIT_M),
         "rotation_deg": float(np.rad2deg(np.median(rotation_rad))),
     }
+
+
+def _right_category(pairs: Sequence[tuple[Estimate, TrueObject]], root: Path) -> float | None:
+    """Percent of the pairs with another mesh than the true one whose mesh is of the true category."""
+    told = [(e.mesh, t.obj_id) for e, t in pairs if e.mesh is not None]
+    if not told or not all((root / name).is_file() for name in (CATEGORIES_FILE, DATABASE_FILE)):
+        return None
+    true = read_json(root / CATEGORIES_FILE)
+    known: dict[str, str] = {}
+    for entry in read_json(root / DATABASE_FILE):
+        known |= {entry["name"]: entry["category"], entry["file"]: entry["category"]}
+        if "library" in entry:
+            known["library:{category}:{seed}".format(**entry["library"])] = entry["category"]
+    return float(100 * np.mean([known.get(mesh) == true[str(obj_id)] for mesh, obj_id in told]))
 
 
 def _some_points(mesh: Any) -> Array:

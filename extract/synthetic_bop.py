@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from .bop import ImageKey, Target, open_dataset
+from .bop_eval import CATEGORIES_FILE, DATABASE_FILE
 from .bop_write import write_models, write_scene, write_targets
 from .errors import UserError
 from .files import atomic_path, write_json
@@ -63,7 +64,7 @@ def stages(folder: Path, *, scenes: int, images: int, seed: int, size_px: tuple[
     def models(progress: Progress) -> Mapping[str, Any]:
         write_models(folder, {thing.obj_id: _painted(thing) for thing in _things(seed).values()})
         known = {str(obj_id): category for obj_id, (category, _) in object_variants().items()}
-        write_json(folder / "categories.json", known)
+        write_json(folder / CATEGORIES_FILE, known)
         return {"models": len(known), "categories": len(CATEGORIES)}
 
     def database(progress: Progress) -> Mapping[str, Any]:
@@ -96,8 +97,8 @@ def stages(folder: Path, *, scenes: int, images: int, seed: int, size_px: tuple[
     rendered = [scene(k) for k in range(scenes)]
     made = {f"scene {k}": folder / stage.outputs[0] for k, stage in enumerate(rendered)}
     return [
-        Stage("models", "build the models", models, {"seed": seed}, {}, ("models", "categories.json"), room),
-        Stage("database", "build the held-out database", database, {}, {}, ("database", "database.json"), room),
+        Stage("models", "build the models", models, {"seed": seed}, {}, ("models", CATEGORIES_FILE), room),
+        Stage("database", "build the held-out database", database, {}, {}, ("database", DATABASE_FILE), room),
         *rendered,
         Stage("targets", "list the targets", targets, {}, made, (f"{SPLIT}_targets_bop19.json",), room),
     ]
@@ -128,7 +129,7 @@ def write_database(folder: Path) -> list[dict[str, Any]]:
     for entry in entries:
         with atomic_path(folder / entry["file"]) as temporary:
             _mesh(entry["category"], int(entry["name"].rpartition("_")[2])).export(temporary)
-    write_json(folder / "database.json", entries)
+    write_json(folder / DATABASE_FILE, entries)
     return entries
 
 

@@ -1,20 +1,22 @@
 """The paper's tables with measured figures in them, from results files.
 
 A row is filled from poses (a BOP csv, or what `eval-bop --json` printed), from proposals (JSON of BOP's segmentation
-task) or tracks (what `compare-track --out` wrote, of one video or several). A row without any says what would fill it.
+task) or tracks (what `compare-track --out` wrote, of one video or several), or any JSON with an object `figures`, from
+a column's name to its value. A row without any says what would fill it.
 """
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
+from math import comb
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from .bop import Dataset, open_dataset, read_json
-from .bop_eval import evaluate
+from .bop_eval import DATABASE_FILE, evaluate
 from .bop_results import read_results
 from .errors import UserError
 from .geometry import rotation_angle_rad, super_fibonacci_rotations
@@ -46,7 +48,7 @@ def fill_table(
     opened = open_dataset(dataset, split) if dataset is not None else None
     rows = []
     for row in table.rows:
-        found = _own_figures(row)
+        found = _own_figures(row, opened)
         if row.key in files:
             found |= _measured(files[row.key], opened, protocol, meshes, progress)
         rows.append(
@@ -115,9 +117,14 @@ def _by_row(results: Sequence[str], rows: Sequence[Row], name: str) -> dict[str,
     return dict(files)
 
 
-def _own_figures(row: Row) -> dict[str, float]:
-    """What can be told of a row without running anything: how far apart its views are."""
+def _own_figures(row: Row, dataset: Dataset | None) -> dict[str, float]:
+    """What can be told of a row without running anything: how far apart its views are, what a blind guess finds."""
     kind, _, count = row.key.partition("-")
+    if kind == "chance" and dataset is not None and (dataset.root / DATABASE_FILE).is_file():
+        of_category = Counter(entry["category"] for entry in read_json(dataset.root / DATABASE_FILE))
+        meshes = of_category.total()
+        missed = {k: np.mean([comb(meshes - n, k) / comb(meshes, k) for n in of_category.values()]) for k in (1, 5)}
+        return {"category_percent": 100 * (1 - float(missed[1])), "category_top5_percent": 100 * (1 - float(missed[5]))}
     if kind != "views":
         return {}
     R = super_fibonacci_rotations(int(count))
@@ -146,6 +153,8 @@ def _measured(
             found |= judge_proposals(_needed(dataset, path), read_proposals(path)).to_json()
         elif "ar_cou" in content:
             found |= content
+        elif isinstance(content.get("figures"), dict):
+            found |= content["figures"]
         elif protocol in content.get("velocity", {}):
             motions.append(content["velocity"][protocol])
         else:

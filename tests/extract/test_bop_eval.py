@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -94,6 +95,20 @@ def test_another_mesh_of_the_same_shape_and_size_is_as_good(dataset: Dataset, tm
     assert scores.adds_m is None
     larger = [replace(e, size_m=0.15) for e in estimates]
     assert evaluate(dataset, larger, folders=(tmp_path,)).scale_error_percent == pytest.approx(25, abs=1e-3)
+
+
+def test_categories_are_judged_where_the_data_set_tells_them(dataset: Dataset, tmp_path: Path) -> None:
+    shutil.copytree(dataset.root, tmp_path / "set")
+    (tmp_path / "set/categories.json").write_text('{"1": "box", "2": "can"}')
+    box = {"name": "box", "category": "box", "file": "box.ply"}
+    mug = {"name": "mug_3", "category": "mug", "file": "mug.ply", "library": {"category": "mug", "seed": 3}}
+    (tmp_path / "set/database.json").write_text(json.dumps([box, mug]))
+    MODELS[1].export(tmp_path / "box.ply")
+    meshes = {1: "box.ply", 2: "library:mug:3"}
+    estimates = [replace(e, mesh=meshes[e.obj_id], size_m=0.1) for e in perfect(dataset)]
+    told = evaluate(open_dataset(tmp_path / "set"), estimates, folders=(tmp_path,)).category_percent
+    assert told == pytest.approx(50)
+    assert evaluate(dataset, estimates, folders=(tmp_path,)).category_percent is None
 
 
 def test_rotation_is_judged_up_to_symmetry(dataset: Dataset) -> None:

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -100,6 +101,20 @@ def test_errors_of_several_tracks_are_averaged(tmp_path: Path) -> None:
         (tmp_path / f"{k}.json").write_text(json.dumps({"velocity": {"official": errors}}))
     table = fill_table("video", [f"refined={tmp_path / f'{k}.json'}" for k in (1, 3)])
     assert row_of(table, "refined")["measured"] == pytest.approx({"e_rot": 2.0, "e_proj": 0.2, "e_depth": 0.02})
+
+
+def test_a_blind_guess_is_told_by_the_database(folder: Path, tmp_path: Path) -> None:
+    shutil.copytree(folder, tmp_path / "set")
+    entries = [{"name": f"{c}{k}", "category": c, "file": f"{c}{k}.ply"} for c in "abcd" for k in range(3)]
+    (tmp_path / "set/database.json").write_text(json.dumps(entries))
+    (tmp_path / "ffa.json").write_text('{"figures": {"category_percent": 81.5}}')
+    table = fill_table("retrieval", [f"classical-ffa={tmp_path / 'ffa.json'}"], dataset=tmp_path / "set")
+    chance = row_of(table, "chance")["measured"]
+    rng = np.random.default_rng(0)
+    draws = np.array([rng.permutation(12)[:5] // 3 for _ in range(20_000)])
+    assert chance["category_percent"] == pytest.approx(25)
+    assert chance["category_top5_percent"] == pytest.approx(100 * np.mean((draws == 0).any(axis=1)), abs=1.5)
+    assert row_of(table, "classical-ffa")["measured"]["category_percent"] == 81.5
 
 
 def test_views_know_their_own_spacing() -> None:
