@@ -92,6 +92,16 @@ def test_a_word_with_commands_below_it_lists_them(words: list[str], capsys: pyte
     assert "retarget" not in told
 
 
+def test_a_word_may_be_a_command_and_have_others_below_it(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["synthesize", "--help"])
+    assert stop.value.code == 0
+    told = capsys.readouterr().out
+    assert "--without-hand" in told
+    assert "  synthesize bop " in told
+    assert "did you mean synthesize bop?" in refused(capsys, "synthesize", "bopp", "--out", "runs/tables")
+
+
 def test_unknown_command_below_a_word_is_answered_with_the_nearest(capsys: pytest.CaptureFixture[str]) -> None:
     line = refused(capsys, "meshes", "lst")
     assert "did you mean meshes list?" in line
