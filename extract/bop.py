@@ -23,7 +23,7 @@ import PIL.Image
 from numpy.typing import NDArray
 
 from .errors import UserError
-from .geometry import Array, make_pose
+from .geometry import Array, angle_between_rad, make_pose, rotation_angle_rad
 from .protocols import Image, Mask
 
 M_PER_MM = 1e-3
@@ -56,11 +56,32 @@ class TrueObject:
 
 
 @dataclass(frozen=True)
+class ModelSymmetry:
+    """Turns of a model that look the same: rotations (K, 3, 3) in its frame, the identity among them, and any turn
+    about each of the axes (unit vectors).
+    """
+
+    rotations: Array = field(default_factory=lambda: np.eye(3)[None])
+    axes: tuple[tuple[float, float, float], ...] = ()
+
+    def error_rad(self, R: Array, R_true: Array) -> float:
+        """Smallest angle between R (3, 3) and what looks like R_true (3, 3)."""
+        if len(self.axes) > 1:  # turns about two axes reach every rotation
+            return 0.0
+        same = R_true @ self.rotations
+        if not self.axes:
+            return float(rotation_angle_rad(R, same).min())
+        axis = np.asarray(self.axes[0])
+        return float(angle_between_rad(R @ axis, same @ axis).min())
+
+
+@dataclass(frozen=True)
 class ModelInfo:
     """What `models_info.json` says of a model: `diameter_m`, the largest distance of two vertices; `extents_m` (3,)."""
 
     diameter_m: float
     extents_m: tuple[float, float, float]
+    symmetry: ModelSymmetry = field(default_factory=ModelSymmetry)
 
 
 @dataclass(frozen=True)
@@ -162,8 +183,8 @@ class Dataset:
         found = {}
         for name, entry in self._json(path).items():
             try:
-                sizes = [float(entry[f"size_{axis}"]) * M_PER_MM for axis in "xyz"]
-                found[int(name)] = ModelInfo(float(entry["diameter"]) * M_PER_MM, (sizes[0], sizes[1], sizes[2]))
+                x, y, z = (float(entry[f"size_{axis}"]) * M_PER_MM for axis in "xyz")
+                found[int(name)] = ModelInfo(float(entry["diameter"]) * M_PER_MM, (x, y, z), _symmetry(entry))
             except (KeyError, TypeError, ValueError) as error:
                 raise UserError(f"{path}: model {name} lacks or garbles {error}; give diameter, size_x, ...") from error
         return found
@@ -267,6 +288,13 @@ def open_dataset(root: Path | str, split: str | None = None) -> Dataset:
             f"{folder} holds neither NNNNNN/scene_camera.json nor NNNNNN_NNNNNN.camera.json; unpack it first"
         )
     return dataset
+
+
+def _symmetry(entry: Mapping[str, Any]) -> ModelSymmetry:
+    turns = [np.asarray(T, float).reshape(4, 4)[:3, :3] for T in entry.get("symmetries_discrete", ())]
+    axes = [np.asarray(turn["axis"], float) for turn in entry.get("symmetries_continuous", ())]
+    units = tuple((float(a[0]), float(a[1]), float(a[2])) for a in (axis / np.linalg.norm(axis) for axis in axes))
+    return ModelSymmetry(np.stack([np.eye(3), *turns]), units)
 
 
 def rle_from_mask(mask: Mask) -> dict[str, Any]:

@@ -19,7 +19,6 @@ from .geometry import Array
 from .metrics import AUC_LIMIT_M, area_under_recall, point_distances
 from .pose_metrics import METRICS, Placed, Protocol, Shape, pose_error, recalls
 from .progress import Progress
-from .symmetry import estimate_symmetry
 
 SAME_OBJECT_IOU = 0.25  # of silhouettes, from which on an estimate is taken to mean a true object
 CATEGORIES_FILE, DATABASE_FILE = "categories.json", "database.json"
@@ -262,13 +261,13 @@ def _of_own_models(pairs: Sequence[tuple[Estimate, TrueObject]], dataset: Datase
     """ADD-S and geodesic errors, which need the same mesh on both sides."""
     if not pairs:
         return {}
-    symmetry = {obj_id: estimate_symmetry(dataset.mesh(obj_id)) for obj_id in {t.obj_id for _, t in pairs}}
-    points = {obj_id: _some_points(dataset.mesh(obj_id)) for obj_id in symmetry}
+    points = {obj_id: _some_points(dataset.mesh(obj_id)) for obj_id in {t.obj_id for _, t in pairs}}
     adds_m, rotation_rad = [], []
     for estimate, truth in pairs:
         T, T_true = estimate.T_camera_object[None], truth.T_camera_object[None]
         adds_m.append(float(point_distances(T, T_true, points[truth.obj_id])[1][0]))
-        rotation_rad.append(float(symmetry[truth.obj_id].error_rad(T[:, :3, :3], T_true[:, :3, :3])[0]))
+        symmetry = dataset.models[truth.obj_id].symmetry
+        rotation_rad.append(symmetry.error_rad(T[0, :3, :3], T_true[0, :3, :3]))
     return {
         "adds_m": _median(adds_m),
         "adds_auc_percent": area_under_recall(np.array(adds_m), AUC_LIMIT_M),

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
-from .bop import LAYOUTS, M_PER_MM, Target, rle_from_mask
+from .bop import LAYOUTS, M_PER_MM, ModelSymmetry, Target, rle_from_mask
 from .errors import UserError
 from .files import atomic_path, write_json
-from .geometry import Array
+from .geometry import Array, make_pose
 from .protocols import Image, Mask
 
 DEPTH_SCALE_MM = 0.1  # of one step of a depth picture: 6.5 m at most
@@ -79,9 +79,12 @@ def write_scene(root: Path, split: str, scene_id: int, frames: Sequence[Frame], 
             write_json(path, {im_id: entry[kind] for im_id, entry in entries.items()})
 
 
-def write_models(root: Path, meshes: Mapping[int, Any]) -> None:
-    """Write `models/obj_*.ply` in mm and `models_info.json` of trimesh.Trimesh in m, by object id."""
-    infos = {}
+def write_models(root: Path, meshes: Mapping[int, Any], symmetries: Mapping[int, ModelSymmetry] | None = None) -> None:
+    """Write `models/obj_*.ply` in mm and `models_info.json` of trimesh.Trimesh in m, by object id.
+
+    symmetries: of the models that look the same after a turn about an axis through their origin.
+    """
+    infos: dict[str, dict[str, Any]] = {}
     for obj_id, mesh in sorted(meshes.items()):
         in_mm = mesh.copy()
         in_mm.apply_scale(1 / M_PER_MM)
@@ -91,6 +94,13 @@ def write_models(root: Path, meshes: Mapping[int, Any]) -> None:
         info = {"diameter": diameter(np.asarray(in_mm.vertices))}
         info |= {f"min_{axis}": float(v) for axis, v in zip("xyz", low, strict=True)}
         infos[str(obj_id)] = info | {f"size_{axis}": float(v) for axis, v in zip("xyz", size, strict=True)}
+        same = (symmetries or {}).get(obj_id, ModelSymmetry())
+        if len(same.rotations) > 1:
+            turns = [R for R in same.rotations if not np.allclose(R, np.eye(3))]
+            infos[str(obj_id)]["symmetries_discrete"] = [_plain(make_pose(R)) for R in turns]
+        if same.axes:
+            turns_about = [{"axis": list(axis), "offset": [0.0, 0.0, 0.0]} for axis in same.axes]
+            infos[str(obj_id)]["symmetries_continuous"] = turns_about
     write_json(root / "models" / "models_info.json", infos)
 
 

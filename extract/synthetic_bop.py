@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from .bop import ImageKey, Target, open_dataset
+from .bop import ImageKey, ModelSymmetry, Target, open_dataset
 from .bop_eval import CATEGORIES_FILE, DATABASE_FILE
 from .bop_write import write_models, write_scene, write_targets
 from .errors import UserError
@@ -62,7 +62,7 @@ def stages(folder: Path, *, scenes: int, images: int, seed: int, size_px: tuple[
     room = ("extract",)
 
     def models(progress: Progress) -> Mapping[str, Any]:
-        write_models(folder, {thing.obj_id: _painted(thing) for thing in _things(seed).values()})
+        write_models(folder, {thing.obj_id: _painted(thing) for thing in _things(seed).values()}, _symmetries())
         known = {str(obj_id): category for obj_id, (category, _) in object_variants().items()}
         write_json(folder / CATEGORIES_FILE, known)
         return {"models": len(known), "categories": len(CATEGORIES)}
@@ -146,6 +146,21 @@ def _things(seed: int) -> dict[int, Thing]:
         mesh = _mesh(category, variant)
         look = vessel_look(rng, make_vessel(category, variant)) if category in VESSELS else thing_look(rng, mesh)
         found[obj_id] = Thing(obj_id, mesh, look, category in _STANDS)
+    return found
+
+
+def _symmetries() -> dict[int, ModelSymmetry]:
+    """Of the shapes; a print may tell their turns apart all the same."""
+    found = {}
+    for obj_id, (category, variant) in object_variants().items():
+        if category == "ball":
+            found[obj_id] = ModelSymmetry(axes=((1.0, 0.0, 0.0), (0.0, 0.0, 1.0)))
+        elif category == "book":
+            found[obj_id] = ModelSymmetry(np.stack([np.eye(3), np.diag([1.0, -1.0, -1.0])]))
+        elif category in VESSELS:
+            own = make_vessel(category, variant).symmetry
+            turns = own.rotations() if own.order else np.eye(3)[None]
+            found[obj_id] = ModelSymmetry(turns, (own.axis,) if own.order == 0 else ())
     return found
 
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
-from vid2demo.extract.bop import ImageKey, Target, mask_from_rle, open_dataset, rle_from_mask
+from vid2demo.extract.bop import ImageKey, ModelSymmetry, Target, mask_from_rle, open_dataset, rle_from_mask
 from vid2demo.extract.bop_results import Estimate, read_results, write_results
 from vid2demo.extract.bop_write import Frame, Instance, box_of, diameter, write_models, write_scene, write_targets
 from vid2demo.extract.errors import UserError
@@ -82,6 +82,26 @@ def test_models_keep_their_size_and_frame(tmp_path: Path) -> None:
     assert entry["min_x"] == pytest.approx(-5.0)
     with pytest.raises(UserError, match="obj_000008"):
         dataset.mesh(8)
+
+
+def test_symmetries_are_kept_and_errors_told_up_to_them(tmp_path: Path) -> None:
+    half = np.stack([np.eye(3), np.diag([-1.0, -1.0, 1.0])])
+    told = {
+        1: ModelSymmetry(half),
+        2: ModelSymmetry(axes=((0.0, 0.0, 1.0),)),
+        4: ModelSymmetry(axes=((0, 0, 1), (1, 0, 0))),
+    }
+    write_models(tmp_path, dict.fromkeys((1, 2, 3, 4), trimesh.creation.box((0.1, 0.1, 0.2))), told)
+    write_scene(tmp_path, "test", 0, [random_frame(np.random.default_rng(0), 0)])
+    read = {obj_id: info.symmetry for obj_id, info in open_dataset(tmp_path).models.items()}
+    assert np.allclose(read[1].rotations, half)
+    R = Rotation.random(rng=np.random.default_rng(3)).as_matrix()
+    spin, tilt = (Rotation.from_euler(axis, 40, degrees=True).as_matrix() for axis in "zx")
+    off_deg = {obj_id: np.rad2deg([s.error_rad(R @ T, R) for T in (spin, tilt, half[1])]) for obj_id, s in read.items()}
+    assert off_deg[1] == pytest.approx([40, 40, 0], abs=1e-5)
+    assert off_deg[2] == pytest.approx([0, 40, 0], abs=1e-5)
+    assert off_deg[3] == pytest.approx([40, 40, 180], abs=1e-5)
+    assert off_deg[4] == pytest.approx([0, 0, 0])
 
 
 def test_targets_file_is_read_where_there_is_one(frames: list[Frame], tmp_path: Path) -> None:
