@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import importlib.util
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -72,7 +72,6 @@ def _export_features(model: str, out: Path, models_dir: Path | None, block: int 
 
 def _export_depth(model: str, out: Path, models_dir: Path | None, picture_px: tuple[int, int]) -> dict[str, str]:
     import numpy as np
-    import torch
     from transformers import AutoImageProcessor, AutoModelForDepthEstimation
 
     card, placement = model_card(model), place("cpu", "full")
@@ -89,11 +88,10 @@ def _export_depth(model: str, out: Path, models_dir: Path | None, picture_px: tu
         "std": " ".join(map(str, processor.image_std)),
     }
 
-    class Depth(torch.nn.Module):
-        def forward(self, pixels: torch.Tensor) -> torch.Tensor:
-            return network(pixel_values=pixels).predicted_depth  # type: ignore[no-any-return]
+    def depth(network: Any, pixels: torch.Tensor) -> Any:
+        return network(pixel_values=pixels).predicted_depth
 
-    _write(Depth(), pixels, out, "depth", facts, batches=False)
+    _write(network, depth, pixels, out, "depth", facts, batches=False)
     return facts
 
 
@@ -104,16 +102,11 @@ def write_tokens(network: Any, side_px: int, out: Path, facts: Mapping[str, str]
     skip = 1 + int(network.config.num_register_tokens)
     _fix_positions(network, side_px)
 
-    class Tokens(torch.nn.Module):
-        def __init__(self) -> None:
-            super().__init__()
-            self.network = network
+    def tokens(network: Any, pixels: torch.Tensor) -> Any:
+        found = network(pixels).last_hidden_state
+        return torch.cat([found[:, :1], found[:, skip:]], dim=1)
 
-        def forward(self, pixels: torch.Tensor) -> torch.Tensor:
-            tokens = self.network(pixels).last_hidden_state
-            return torch.cat([tokens[:, :1], tokens[:, skip:]], dim=1)
-
-    _write(Tokens(), torch.zeros(2, 3, side_px, side_px), out, "tokens", facts, batches=True)
+    _write(network, tokens, torch.zeros(2, 3, side_px, side_px), out, "tokens", facts, batches=True)
 
 
 def _fix_positions(network: Any, side_px: int) -> None:
@@ -129,14 +122,25 @@ def _fix_positions(network: Any, side_px: int) -> None:
         embeddings.interpolate_pos_encoding = lambda tokens, height, width: fixed
 
 
-def _write(network: Any, pixels: Any, out: Path, result: str, facts: Mapping[str, str], batches: bool) -> None:
+def _write(
+    network: Any, ask: Callable[..., Any], pixels: Any, out: Path, result: str, facts: Mapping[str, str], batches: bool
+) -> None:
+    """Write what `ask(network, pixels)` computes."""
     import torch
+
+    class Asked(torch.nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.network = network  # a part of it, so that its weights are the file's
+
+        def forward(self, pixels: torch.Tensor) -> Any:
+            return ask(self.network, pixels)
 
     axes = {"pixels": {0: "batch"}, result: {0: "batch"}} if batches else None
     with atomic_path(out) as temporary, _without_onnx_package(), warnings.catch_warnings(), torch.inference_mode():
         warnings.simplefilter("ignore")  # the tracer's, about sizes that are fixed here on purpose
         torch.onnx.export(
-            network.eval(), (pixels,), str(temporary), dynamo=False, opset_version=OPSET, input_names=["pixels"],
+            Asked().eval(), (pixels,), str(temporary), dynamo=False, opset_version=OPSET, input_names=["pixels"],
             output_names=[result], dynamic_axes=axes,
         )  # fmt: skip
         with open(temporary, "ab") as stream:
