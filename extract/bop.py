@@ -307,15 +307,37 @@ def rle_from_mask(mask: Mask) -> dict[str, Any]:
 
 
 def mask_from_rle(coded: Mapping[str, Any], where: str = "the mask") -> Mask:
-    """The mask (H, W) that `rle_from_mask` coded. Raises UserError when the lengths do not fill it."""
+    """The mask (H, W) that `rle_from_mask` coded, or that COCO's tools did, who pack the lengths into text.
+
+    Raises UserError when the lengths do not fill it.
+    """
     counts, size = coded.get("counts"), coded.get("size")
-    if not isinstance(counts, Sequence) or isinstance(counts, str) or not isinstance(size, Sequence) or len(size) != 2:
+    if isinstance(counts, str):
+        counts = _unpacked(counts)
+    if not isinstance(counts, Sequence) or not isinstance(size, Sequence) or len(size) != 2:
         raise UserError(f"{where} is not run-length coded as {{counts: [...], size: [height, width]}}")
     height, width = (int(n) for n in size)
     if sum(counts) != height * width or min(counts, default=0) < 0:
         raise UserError(f"{where}: runs of {sum(counts)} pixels do not fill {width} x {height}")
     flat = np.repeat(np.arange(len(counts)) % 2 == 1, np.asarray(counts, np.int64))
     return np.asarray(flat.reshape((height, width), order="F"))
+
+
+def _unpacked(text: str) -> list[int]:
+    """Lengths of runs from COCO's text: groups of five bits, lowest first, each length told by its change."""
+    counts: list[int] = []
+    value = shift = 0
+    for character in text:
+        bits = ord(character) - 48
+        value |= (bits & 0x1F) << shift
+        shift += 5
+        if bits & 0x20:  # more of this number follows
+            continue
+        if bits & 0x10:  # negative
+            value -= 1 << shift
+        counts.append(value + (counts[-2] if len(counts) > 2 else 0))
+        value = shift = 0
+    return counts
 
 
 def read_json(path: Path) -> Any:

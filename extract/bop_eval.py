@@ -30,11 +30,11 @@ class Scores:
     """What a results file is worth.
 
     ar_*: average recalls in percent, `ar` the mean of the three. recall: metric -> ten recalls in percent, at
-    `pose_metrics.limits`. targets, estimates, images: how many. The further ones are medians over the targets that an
-    estimate clearly means, `matched` of them: scale_error_percent of the largest extent; and where the estimate is of
-    the data set's own model, adds_m and rotation_deg (up to symmetry), with the share of ADD-S up to 10 cm in percent.
-    category_percent: in how many of them the mesh is of the right category, where the data set tells (`categories.json`
-    and `database.json`, as `synthesize bop` writes them).
+    `pose_metrics.limits`; by_object: object id -> its targets and average recalls. targets, estimates, images: how many.
+    The further ones are of the targets that an estimate clearly means, `matched` of them: scale_error_percent, the median
+    error of the largest extent; where the estimate is of the data set's own model, the medians adds_m and rotation_deg
+    (up to symmetry), and the share of ADD-S up to 10 cm; and where the data set tells categories (`categories.json` and
+    `database.json`, as `synthesize bop` writes them) category_percent, how often a mesh is of the right one.
     """
 
     protocol: str
@@ -53,6 +53,7 @@ class Scores:
     category_percent: float | None = None
     seconds_per_image: float | None = None
     recall: dict[str, list[float]] = field(default_factory=dict)
+    by_object: dict[str, dict[str, float]] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
         return asdict(self)
@@ -120,7 +121,8 @@ def evaluate(
     for estimate in estimates:
         by_image[estimate.image].append(estimate)
     shape = _shapes(dataset, tuple(folders))
-    found = {metric: np.zeros(10, np.int64) for metric in METRICS}
+    found: dict[str, list[NDArray[np.bool_]]] = {metric: [] for metric in METRICS}
+    of_object: list[int] = []
     pairs: list[tuple[Estimate, TrueObject]] = []
     for done, (image, truths) in enumerate(sorted(wanted.items()), start=1):
         camera, size_px = dataset.camera_matrix(image), dataset.size_px(image)
@@ -130,6 +132,7 @@ def evaluate(
             Placed(shape(e.obj_id, e.mesh, e.size_m), e.T_camera_object, camera, size_px, protocol) for e in of_image
         ]
         scores = np.array([e.score for e in of_image])
+        of_object += [t.obj_id for t in truths]
         allowed = np.array([[_may_mean(e, t, protocol) for t in truths] for e in of_image], bool)
         allowed = allowed.reshape(len(placed), len(true))
         diameters_m = [dataset.models[t.obj_id].diameter_m for t in truths]
@@ -139,13 +142,14 @@ def evaluate(
         for metric in METRICS:
             errors = _errors(metric, placed, true, diameters_m, allowed, order, only_best)
             order = np.argsort(errors, axis=0) if metric == "cou" else order
-            found[metric] += recalls(errors, metric, protocol, scores, [t.obj_id for t in truths])
+            found[metric].append(recalls(errors, metric, protocol, scores, [t.obj_id for t in truths]))
             if metric == "cou":
                 pairs += [(of_image[k], truths[n]) for n, k in _meant(errors)]
         if progress is not None:
             progress(done, len(wanted), "judging")
-    count = sum(map(len, wanted.values()))
-    recall = {metric: (100 * found[metric] / max(count, 1)).tolist() for metric in METRICS}
+    right = {metric: np.concatenate([np.zeros((10, 0), bool), *found[metric]], axis=1) for metric in METRICS}
+    count = len(of_object)
+    recall = {metric: (100 * right[metric].sum(axis=1) / max(count, 1)).tolist() for metric in METRICS}
     average = {metric: float(np.mean(recall[metric])) for metric in METRICS}
     times = {e.image: e.time_s for e in estimates if e.time_s is not None}
     return Scores(
@@ -163,6 +167,7 @@ def evaluate(
         category_percent=_right_category(pairs, dataset.root),
         seconds_per_image=float(np.mean(list(times.values()))) if times else None,
         recall=recall,
+        by_object=_by_object(right, np.array(of_object, int)),
     )
 
 
@@ -243,6 +248,15 @@ def _errors(
                 if only_best[n]:
                     enough = min(enough, errors[k, n])
     return errors
+
+
+def _by_object(right: Mapping[str, NDArray[np.bool_]], of_object: NDArray[np.int64]) -> dict[str, dict[str, float]]:
+    told = {}
+    for obj_id in np.unique(of_object):
+        own = of_object == obj_id
+        average = {f"ar_{metric}": float(100 * right[metric][:, own].mean()) for metric in METRICS}
+        told[str(obj_id)] = {"targets": int(own.sum())} | average
+    return told
 
 
 def _meant(errors: Array) -> list[tuple[int, int]]:

@@ -190,14 +190,14 @@ def limits(metric: str, protocol: Protocol) -> Array:
     return LIMITS[metric] ** 2 if protocol == "paper" and metric != "cou" else LIMITS[metric]
 
 
-def recalls(errors: Array, metric: str, protocol: Protocol, scores: Array, obj_ids: Sequence[int]) -> NDArray[np.int64]:
-    """(10,) how many true objects are found at each limit, from errors (E, T) of E estimates of T true objects.
+def recalls(errors: Array, metric: str, protocol: Protocol, scores: Array, obj_ids: Sequence[int]) -> NDArray[np.bool_]:
+    """(10, T) which true objects are found at each limit, from errors (E, T) of E estimates of T true objects.
 
     The surest estimates choose first (`scores` (E,)), each the nearest object that is left, and serves that one alone.
     The official code does so for each kind of object by itself (`obj_ids`, T of them), and offers it all estimates: one
     may find several objects of different kinds, and spurious ones cost nothing.
     """
-    found = np.zeros(10, np.int64)
+    found = np.zeros((10, errors.shape[1]), bool)
     ids = np.zeros(len(obj_ids), int) if protocol == "paper" else np.asarray(obj_ids)
     order = np.argsort(-scores, kind="stable")
     for n, limit in enumerate(limits(metric, protocol)):
@@ -209,5 +209,5 @@ def recalls(errors: Array, metric: str, protocol: Protocol, scores: Array, obj_i
                 best = int(np.argmin(candidates))
                 if candidates[best] < np.inf:
                     left[best] = False
-            found[n] += np.count_nonzero(~left)
+            found[n, ids == kind] = ~left
     return found

@@ -171,8 +171,31 @@ def test_run_length_coding_is_exact(mask: np.ndarray) -> None:
     assert coded == {"counts": counts, "size": list(mask.shape)}
 
 
+def packed(counts: list[int]) -> str:
+    """COCO's text, bit by bit: five at a time, lowest first, a sixth tells that more follow, 48 is added."""
+    text = ""
+    for k, count in enumerate(counts):
+        value = count - (counts[k - 2] if k > 2 else 0)
+        while True:
+            bits, value = value & 31, value >> 5
+            last = value == (-1 if bits & 16 else 0)
+            text += chr(bits + (0 if last else 32) + 48)
+            if last:
+                break
+    return text
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.lists(st.integers(1, 3000), min_size=1, max_size=9))
+def test_lengths_packed_as_coco_does_are_read(counts: list[int]) -> None:
+    size = [1, sum(counts)]
+    assert np.array_equal(
+        mask_from_rle({"counts": packed(counts), "size": size}), mask_from_rle({"counts": counts, "size": size})
+    )
+
+
 def test_runs_that_do_not_fill_the_picture_are_refused() -> None:
-    for coded in ({"counts": [3], "size": [2, 2]}, {"counts": "aB3", "size": [2, 2]}, {}):
+    for coded in ({"counts": [3], "size": [2, 2]}, {"counts": "3", "size": [2, 2]}, {}):
         with pytest.raises(UserError, match="here"):
             mask_from_rle(coded, "here")
 

@@ -34,6 +34,13 @@ POSES = {
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     folder = tmp_path_factory.mktemp("set")
     write_models(folder, MODELS, {2: ModelSymmetry(axes=((0.0, 0.0, 1.0),))})
+    write_scene(folder, "test", 3, frames())
+    write_targets(folder, "test", [Target(ImageKey(3, k), obj_id, 1) for k in (0, 5) for obj_id in (1, 2)])
+    return open_dataset(folder)
+
+
+def frames() -> list[Frame]:
+    """Two equal pictures of both objects."""
     instances = []
     for obj_id, T in POSES.items():
         window = render_depth(MODELS[obj_id].vertices, np.asarray(MODELS[obj_id].faces, np.int32), T, CAMERA)
@@ -41,10 +48,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
         mask = window.mask_in_image(*SIZE)
         instances.append(Instance(obj_id, T, mask, mask))
     picture = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
-    frames = [Frame(k, picture, np.ones(SIZE[::-1], np.float32), CAMERA, tuple(instances)) for k in (0, 5)]
-    write_scene(folder, "test", 3, frames)
-    write_targets(folder, "test", [Target(ImageKey(3, k), obj_id, 1) for k in (0, 5) for obj_id in (1, 2)])
-    return open_dataset(folder)
+    return [Frame(k, picture, np.ones(SIZE[::-1], np.float32), CAMERA, tuple(instances)) for k in (0, 5)]
 
 
 def perfect(dataset: Dataset) -> list[Estimate]:
@@ -73,6 +77,18 @@ def test_no_estimates_have_no_marks(dataset: Dataset) -> None:
 
 def test_half_the_objects_give_half_the_recall(dataset: Dataset) -> None:
     assert evaluate(dataset, perfect(dataset)[:2]).ar == pytest.approx(50)
+    boxes = evaluate(dataset, [e for e in perfect(dataset) if e.obj_id == 1]).by_object
+    assert boxes["1"] == {"targets": 2, "ar_cou": 100, "ar_ch": 100, "ar_pch": 100}
+    assert boxes["2"]["ar_ch"] == 0
+
+
+def test_the_layout_of_the_files_does_not_matter(dataset: Dataset, tmp_path: Path) -> None:
+    shutil.copytree(dataset.root / "models", tmp_path / "models")
+    write_scene(tmp_path, "test", 3, frames(), "images")
+    other = open_dataset(tmp_path)
+    assert other.layout == "images"
+    scores = evaluate(other, [replace(e, score=0.1) for e in perfect(dataset)])
+    assert (scores.ar, scores.targets) == (100, 4)
 
 
 def test_spurious_estimates_cost_nothing_officially_and_wrong_names_do_not_matter(dataset: Dataset) -> None:
