@@ -30,11 +30,12 @@ class Scores:
     """What a results file is worth.
 
     ar_*: average recalls in percent, `ar` the mean of the three. recall: metric -> ten recalls in percent, at
-    `pose_metrics.limits`; by_object: object id -> its targets and average recalls. targets, estimates, images: how many.
-    The further ones are of the targets that an estimate clearly means, `matched` of them: scale_error_percent, the median
-    error of the largest extent; where the estimate is of the data set's own model, the medians adds_m and rotation_deg
-    (up to symmetry), and the share of ADD-S up to 10 cm; and where the data set tells categories (`categories.json` and
-    `database.json`, as `synthesize bop` writes them) category_percent, how often a mesh is of the right one.
+    `pose_metrics.limits`; by_object: object id -> its targets and average recalls. targets, estimates, images: counts.
+    The further ones are of the targets that an estimate clearly means, `matched` of them: scale_error_percent, the
+    median error of the largest extent; where the estimate is of the data set's own model, the medians adds_m and
+    rotation_deg (up to symmetry), and the share of ADD-S up to 10 cm; and where the data set tells categories (in
+    `categories.json` and `database.json`, as `synthesize bop` writes them) category_percent, how often a mesh is of the
+    right one.
     """
 
     protocol: str
