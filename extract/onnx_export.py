@@ -88,11 +88,17 @@ def _export_depth(model: str, out: Path, models_dir: Path | None, picture_px: tu
         "std": " ".join(map(str, processor.image_std)),
     }
 
+    write_depth(network, pixels, out, facts)
+    return facts
+
+
+def write_depth(network: Any, pixels: torch.Tensor, out: Path, facts: Mapping[str, str]) -> None:
+    """Write a depth network for one picture of the size of `pixels`: (1, 3, h, w) to depth (1, h, w)."""
+
     def depth(network: Any, pixels: torch.Tensor) -> Any:
         return network(pixel_values=pixels).predicted_depth
 
     _write(network, depth, pixels, out, "depth", facts, batches=False)
-    return facts
 
 
 def write_tokens(network: Any, side_px: int, out: Path, facts: Mapping[str, str]) -> None:
