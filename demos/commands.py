@@ -200,8 +200,28 @@ class CheckTrajectory(Command):
         return 0 if result["ok"] else 1
 
 
+@dataclass(frozen=True, kw_only=True)
+class Figure(Command):
+    """Draw a run: figure.png with rows input, prediction and simulation, and joints.png with all limits.
+
+    For example: vid2demo figure runs/coffee --times 0.5 2 3.5
+    """
+
+    folder: Positional[Annotated[Path, arg(metavar="DIR", help="Folder of a run, with its films.")]]
+    times: Annotated[tuple[float, ...] | None, told("S ...", "Moments of the video [s]. Default: evenly over it.")] = (
+        None
+    )
+    columns: Annotated[int, arg(metavar="N", help="How many moments, where no times are given [count].")] = 5
+
+    def do(self) -> Result:
+        from .figure import figure
+
+        return figure(self.folder, self.times, self.columns)
+
+
 COMMANDS: Commands = {
     "retarget": Retarget,
+    "figure": Figure,
     "export-trajectory": ExportTrajectory,
     "check-trajectory": CheckTrajectory,
     "simulate": Simulate,

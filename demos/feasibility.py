@@ -6,10 +6,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..envs.grasps import MAX_WIDTH_M
 from ..envs.kinematics import limit_margin_rad, manipulability, panda_chain
-from ..envs.panda import DQ_MAX_RAD_S, TAU_MAX_NM
+from ..envs.panda import DQ_MAX_RAD_S, PAYLOAD_MAX_KG, TAU_MAX_NM
 from ..extract.geometry import Array
-from .retarget import tracking_errors
+from .export import commands_of
+from .limits import LIMITS, Extreme, commanded, extremes
+from .retarget import Solver, retarget, tracking_errors
 
 if TYPE_CHECKING:
     from ..envs.reference import Reference
@@ -18,44 +21,71 @@ if TYPE_CHECKING:
 GOOD_POSITION_M, GOOD_ROTATION_RAD = 0.01, np.deg2rad(5.0)
 _TIGHT_RAD = 0.05
 _SHOULDER = np.array([0.0, 0.0, 0.333])
+# While the tilt is above this part of its greatest value it is the pour.
+_POURING_PART = 0.5
+_SLOWER = (1.0, 1.4, 2.0)
 
 
 def feasibility(reference: Reference, joints: JointTrajectory) -> dict[str, Any]:
     """Findings (JSON-like) about a joint trajectory made for a reference on the same clock.
 
-    `feasible`: tracking within 1 cm and 5 degrees, joint, speed and torque limits kept, no collision.
-    `words`: the same in plain sentences. Raises ValueError when the two differ in length.
+    `feasible`: tracking within 1 cm and 5 degrees, all limits of joints, gripper and payload kept, no collision.
+    `limits`: where the motion comes nearest to each limit at 1 kHz, and the margin that is left of it. `phases`: errors
+    before, in and after the pour. `changed`: from the video, in numbers. `variant`: for what is not feasible, the
+    nearest motion found that is, and how far that is away; None if there is none. `words`: all of it in plain
+    sentences. Raises ValueError when the two differ in length.
     """
+    findings, problems = _findings(reference, joints)
+    findings["feasible"] = not problems
+    findings["variant"] = _variant(reference, joints, findings) if problems else None
+    note = joints.header.get("solver", {}).get("note")
+    said = [findings["variant"]["words"]] if findings["variant"] else []
+    findings["words"] = [*_words(findings, problems, said), *([note] if note else []), *reference.notes]
+    return findings
+
+
+def _findings(reference: Reference, joints: JointTrajectory) -> tuple[dict[str, Any], list[str]]:
+    """All but the verdict, and what is wrong."""
     if len(joints) != len(reference):
         raise ValueError(f"the reference has {len(reference)} knots, the joint trajectory {len(joints)}")
     position_m, rotation_rad = tracking_errors(reference, joints.q_rad)
     margin = limit_margin_rad(joints.q_rad)
     speed_part = np.abs(joints.dq_rad_s) / DQ_MAX_RAD_S
     torque_part = np.abs(joints.tau_nm) / TAU_MAX_NM
-    collisions = list(reference.header.get("feasibility", {}).get("collisions", []))
     hand = panda_chain().hand(joints.q_rad)[:, :3, 3]
+    told = commands_of(joints)
+    found = extremes(commanded(told.q_rad, told.tau_nm))
+    nearest = {name: max((e for e in found if e.quantity == name), key=lambda e: e.part) for name in LIMITS}
+    grasp = reference.header.get("grasp", {})
     findings: dict[str, Any] = {
         "position_error_m": _summary(position_m, joints.time_s),
         "rotation_error_rad": _summary(rotation_rad, joints.time_s),
+        "phases": _phases(reference, position_m, rotation_rad),
         "joint_limit_margin_rad": _per_joint(margin, joints.time_s, smallest=True),
         "speed_part_of_limit": _per_joint(speed_part, joints.time_s, smallest=False),
         "torque_part_of_limit": _per_joint(torque_part, joints.time_s, smallest=False),
+        "limits": {name: _limit(extreme) for name, extreme in nearest.items()},
         "reach_m": float(np.linalg.norm(hand - _SHOULDER, axis=1).max()),
         "manipulability": float(manipulability(joints.q_rad).min()),
         "lowest_hand_m": float(hand[:, 2].min()),
-        "collisions": collisions,
+        "collisions": list(reference.header.get("feasibility", {}).get("collisions", [])),
         "scale": reference.scale,
         "time_stretch": float(reference.header.get("time_stretch", 1.0)),
         "solver": joints.header.get("solver", {}).get("name", "mink"),
         "payload_kg": float(joints.header.get("payload_kg", 0.0)),
+        "gripper_width_m": float(grasp.get("width_m", 0.0)),
         "caught_part_of_jet": reference.header.get("feasibility", {}).get("caught_part_of_jet"),
+        "changed": _changed(reference),
         "changes": reference.notes,
     }
     problems = _problems(findings, margin, speed_part, torque_part)
-    findings["feasible"] = not problems
-    note = joints.header.get("solver", {}).get("note")
-    findings["words"] = [*_words(findings, problems), *([note] if note else []), *reference.notes]
-    return findings
+    problems += [
+        f"joint {e.joint} exceeds its {name} limit ({e.value:.3g} {LIMITS[name].unit} at {e.time_s:.2f} s, "
+        f"limit {e.limit:.3g})"
+        for name, e in nearest.items()
+        if name in ("acceleration", "jerk", "torque rate") and e.broken
+    ]
+    return findings, problems
 
 
 def _problems(findings: dict[str, Any], margin: Array, speed_part: Array, torque_part: Array) -> list[str]:
@@ -77,6 +107,16 @@ def _problems(findings: dict[str, Any], margin: Array, speed_part: Array, torque
     ):
         if part.max() > 1.0 + 1e-6:
             problems.append(f"joint {int(part.argmax()) + 1} exceeds its {kind} limit")
+    if findings["payload_kg"] > PAYLOAD_MAX_KG:
+        problems.append(
+            f"vessel and contents weigh {findings['payload_kg']:.1f} kg, "
+            f"the arm carries {PAYLOAD_MAX_KG:.0f} kg at most"
+        )
+    if findings["gripper_width_m"] > MAX_WIDTH_M:
+        problems.append(
+            f"the vessel is {100 * findings['gripper_width_m']:.1f} cm wide where it is held, the fingers open to "
+            f"{100 * MAX_WIDTH_M:.1f} cm"
+        )
     problems += [
         f"the {c['first']} touches the {c['second']} around {c['video_time_s']:.1f} s of the video"
         for c in findings["collisions"]
@@ -84,7 +124,74 @@ def _problems(findings: dict[str, Any], margin: Array, speed_part: Array, torque
     return problems
 
 
-def _words(findings: dict[str, Any], problems: list[str]) -> list[str]:
+def _phases(reference: Reference, position_m: Array, rotation_rad: Array) -> list[dict[str, Any]]:
+    """Errors before, in and after the pour; a motion that never tilts is one phase."""
+    tilt_rad = reference.tilt_rad
+    pouring = np.flatnonzero(tilt_rad >= _POURING_PART * tilt_rad.max())
+    first, last = (
+        (int(pouring[0]), int(pouring[-1]) + 1) if tilt_rad.max() > np.deg2rad(10.0) else (len(reference),) * 2
+    )
+    spans = {"carry": slice(0, first), "pour": slice(first, last), "return": slice(last, len(reference))}
+    return [
+        {
+            "name": name,
+            "from_s": float(reference.time_s[span][0]),
+            "to_s": float(reference.time_s[span][-1]),
+            "position_error_m": {"mean": float(position_m[span].mean()), "max": float(position_m[span].max())},
+            "rotation_error_rad": {"mean": float(rotation_rad[span].mean()), "max": float(rotation_rad[span].max())},
+        }
+        for name, span in spans.items()
+        if span.stop > span.start
+    ]
+
+
+def _changed(reference: Reference) -> dict[str, Any]:
+    """What the robot does otherwise than the video shows, in numbers; `changes` tells the same in words."""
+    video_s = float(reference.video_time_s[-1] - reference.video_time_s[0])
+    return {
+        "scale": reference.scale,
+        "time_stretch": float(reference.header.get("time_stretch", 1.0)),
+        "video_s": video_s,
+        "robot_s": reference.duration_s,
+        "unsure_part": float(np.mean(reference.confidence < 0.2)),
+        **reference.header.get("changed", {}),
+    }
+
+
+def _limit(extreme: Extreme) -> dict[str, Any]:
+    return {
+        "joint": extreme.joint,
+        "at_s": extreme.time_s,
+        "value": extreme.value,
+        "limit": extreme.limit,
+        "unit": LIMITS[extreme.quantity].unit,
+        "part": extreme.part,
+        "margin": 1.0 - extreme.part,
+    }
+
+
+def _variant(reference: Reference, joints: JointTrajectory, findings: dict[str, Any]) -> dict[str, Any] | None:
+    """The nearest feasible motion, where going slower is what helps; else None."""
+    parts = {name: entry["part"] for name, entry in findings["limits"].items()}
+    speed = max(max(entry["value"] for entry in findings["speed_part_of_limit"]), parts["speed"])
+    needed = max(speed, parts["acceleration"] ** 0.5, parts["jerk"] ** (1 / 3), 1.05)
+    solver: Solver = "torque" if findings["solver"] == "crocoddyl" else "mink"
+    contents_kg = joints.header.get("contents_kg")
+    for more in _SLOWER:
+        factor = 1.03 * needed * more
+        slow = reference.stretched(factor)
+        _, problems = _findings(slow, retarget(slow, contents_kg=contents_kg, strict=False, solver=solver))
+        if not problems:
+            return {
+                "time_stretch": factor,
+                "extra_s": slow.duration_s - reference.duration_s,
+                "words": f"Played {factor:.2f} times slower (--speed {1.0 / factor:.2f}), {slow.duration_s:.1f} s in "
+                f"place of {reference.duration_s:.1f} s, it can.",
+            }
+    return None
+
+
+def _words(findings: dict[str, Any], problems: list[str], variant: list[str]) -> list[str]:
     position, rotation = findings["position_error_m"], findings["rotation_error_rad"]
     verdict = (
         "The arm can do this motion." if not problems else f"The arm cannot do this motion well: {'; '.join(problems)}."
@@ -93,8 +200,10 @@ def _words(findings: dict[str, Any], problems: list[str]) -> list[str]:
     tightest = min(margins, key=lambda entry: float(entry["value"]))
     fastest = max(findings["speed_part_of_limit"], key=lambda entry: float(entry["value"]))
     strongest = max(findings["torque_part_of_limit"], key=lambda entry: float(entry["value"]))
+    bend, jerk = (findings["limits"][name] for name in ("acceleration", "jerk"))
     words = [
         verdict,
+        *variant,
         f"In the plan the object stays within {1000 * position['max']:.1f} mm and {np.rad2deg(rotation['max']):.1f} "
         f"degrees of the reference ({1000 * position['mean']:.2f} mm and {np.rad2deg(rotation['mean']):.2f} degrees on "
         "average).",
@@ -104,6 +213,8 @@ def _words(findings: dict[str, Any], problems: list[str]) -> list[str]:
         f"at {fastest['at_s']:.1f} s; joint {strongest['joint']} works hardest: "
         f"{100 * strongest['value']:.0f}% of its torque limit, with "
         f"{findings['payload_kg']:.2f} kg in the hand.",
+        f"At 1 kHz the largest acceleration is {100 * bend['part']:.0f}% of its limit (joint {bend['joint']}), the "
+        f"largest jerk {100 * jerk['part']:.0f}% (joint {jerk['joint']}).",
     ]
     if tightest["value"] < _TIGHT_RAD:
         words.append("That is tight: a small change of the motion may not be possible.")

@@ -47,7 +47,7 @@ def test_help_names_every_command_and_begins_at_once() -> None:
 
 def test_commands_of_the_design_are_there() -> None:
     wanted = {"run", "extract", "retarget", "simulate", "play", "collect", "replay", "meshes", "synthesize", "report"}
-    wanted |= {"export-trajectory", "check-trajectory"}
+    wanted |= {"export-trajectory", "check-trajectory", "figure"}
     assert {*wanted, "demo", "compare-track"} <= {name.split()[0] for name in cli.COMMANDS}
 
 

@@ -8,6 +8,7 @@ import pytest
 from vid2demo.demos.feasibility import feasibility
 from vid2demo.demos.joints import JointTrajectory
 from vid2demo.demos.retarget import retarget
+from vid2demo.envs.builtin import builtin_reference
 from vid2demo.envs.kinematics import panda_chain
 from vid2demo.envs.panda import DQ_MAX_RAD_S, Q_HOME_RAD, Q_MAX_RAD, TAU_MAX_NM
 from vid2demo.envs.reference import Reference, minimum_jerk, vessel_to_header
@@ -15,7 +16,7 @@ from vid2demo.extract.geometry import Array, make_pose
 from vid2demo.extract.vessels import make_vessel
 
 
-def moved(target_rad: Array, knots: int = 51) -> tuple[Reference, JointTrajectory]:
+def moved(target_rad: Array, knots: int = 51, strict: bool = True) -> tuple[Reference, JointTrajectory]:
     """The reference that the arm makes itself on its way from home to a configuration, and its retargeting."""
     q = Q_HOME_RAD + minimum_jerk(np.linspace(0, 1, knots))[:, None] * (target_rad - Q_HOME_RAD)
     T_hand_object = make_pose(None, (0.0, 0.0, 0.05))
@@ -28,7 +29,7 @@ def moved(target_rad: Array, knots: int = 51) -> tuple[Reference, JointTrajector
         "time_stretch": 1.25,
     }
     reference = Reference.from_poses(panda_chain().hand(q) @ T_hand_object, np.arange(knots) / 25.0, header)
-    return reference, retarget(reference)
+    return reference, retarget(reference, strict=strict)
 
 
 @pytest.fixture(scope="module")
@@ -102,3 +103,61 @@ def test_different_clocks_are_refused(easy: tuple[Reference, JointTrajectory]) -
     reference, joints = easy
     with pytest.raises(ValueError, match="knots"):
         feasibility(reference.stretched(2.0), joints)
+
+
+def test_every_limit_is_told_with_its_margin(easy: tuple[Reference, JointTrajectory]) -> None:
+    findings = feasibility(*easy)
+    limits = findings["limits"]
+    assert set(limits) == {"position", "speed", "acceleration", "jerk", "torque", "torque rate"}
+    for entry in limits.values():
+        assert 0.0 < entry["part"] < 1.0
+        assert entry["margin"] == pytest.approx(1.0 - entry["part"])
+    assert limits["speed"]["part"] == pytest.approx(
+        max(entry["value"] for entry in findings["speed_part_of_limit"]), rel=0.02
+    )
+    assert findings["variant"] is None
+
+
+def test_errors_are_told_before_in_and_after_the_pour() -> None:
+    reference = builtin_reference()
+    joints = retarget(reference, solver="mink")
+    q = joints.q_rad.copy()
+    pour = reference.pour_index
+    q[pour, 0] += 0.01
+    phases = feasibility(reference, dataclasses.replace(joints, q_rad=q))["phases"]
+    assert [phase["name"] for phase in phases] == ["carry", "pour", "return"][: len(phases)]
+    worst = max(phases, key=lambda phase: float(phase["position_error_m"]["max"]))
+    assert worst["name"] == "pour"
+    assert worst["from_s"] <= reference.time_s[pour] <= worst["to_s"]
+    assert phases[0]["position_error_m"]["max"] < 1e-3
+
+
+def test_too_fast_a_motion_comes_with_the_nearest_that_is_not() -> None:
+    reference, joints = moved(Q_HOME_RAD + np.array([0.8, 0.4, 0.0, 0.4, 0.0, 0.6, 0.4]), knots=14, strict=False)
+    findings = feasibility(reference, joints)
+    assert findings["feasible"] is False
+    assert "exceeds its acceleration limit" in findings["words"][0]
+    factor = findings["variant"]["time_stretch"]
+    assert 1.05 < factor < 4.0
+    assert f"--speed {1 / factor:.2f}" in findings["words"][1]
+    slow = reference.stretched(factor)
+    assert feasibility(slow, retarget(slow))["feasible"] is True
+
+
+def test_too_heavy_and_too_wide_are_told_with_both_numbers(easy: tuple[Reference, JointTrajectory]) -> None:
+    reference, _ = easy
+    heavy = retarget(reference, contents_kg=4.0, strict=False)
+    verdict = feasibility(reference, heavy)["words"][0]
+    assert "weigh 4.3 kg, the arm carries 3 kg at most" in verdict
+    wide = reference.with_header(grasp={"kind": "body", "width_m": 0.1, "fits": False})
+    findings = feasibility(wide, retarget(wide))
+    assert findings["feasible"] is False
+    assert "10.0 cm wide where it is held, the fingers open to 7.8 cm" in findings["words"][0]
+    assert findings["variant"] is None
+
+
+def test_what_was_changed_is_told_in_numbers(easy: tuple[Reference, JointTrajectory]) -> None:
+    changed = feasibility(*easy)["changed"]
+    assert changed["scale"] == 0.9
+    assert changed["time_stretch"] == 1.25
+    assert changed["robot_s"] == pytest.approx(2.0)
