@@ -1,8 +1,8 @@
 """A data set of synthetic table tops in BOP's format, and a database of meshes that are not the ones in it.
 
 As in the wild, what is seen is not in the database: of every category some variants are rendered and others are held
-out, and only these are written to `database/`, listed in `database.json` as {"name", "category", "file"} and, for a
-vessel of the library, "library": {"category", "seed"}. `categories.json` tells every object id's category.
+out, and only these are written to `database/CATEGORY/`, listed in `database.json` as {"name", "category", "file"} and,
+for a vessel of the library, "library": {"category", "seed"}. `categories.json` tells every object id's category.
 """
 
 from __future__ import annotations
@@ -116,7 +116,8 @@ def held_out() -> list[dict[str, Any]]:
     for category in CATEGORIES:
         for seed in range(RENDERED, RENDERED + HELD_OUT):
             name = f"{category}_{seed}"
-            entry: dict[str, Any] = {"name": name, "category": category, "file": f"database/{name}.ply"}
+            file = f"database/{category}/{name}.ply"
+            entry: dict[str, Any] = {"name": name, "category": category, "file": file}
             if category in VESSELS:
                 entry["library"] = {"category": category, "seed": seed}
             entries.append(entry)
