@@ -2,9 +2,10 @@
 
     python bench/retrieval_baselines.py [DATASET] [--views 200] [--out runs/moments.json]
 
-DATASET is what `vid2demo synthesize bop` wrote; without one it is rendered to runs/tables first. Each mesh of its database is drawn in VIEWS silhouettes; a mask takes
-the mesh with the most alike one, by Hu's seven moments and the share of its least rectangle that it fills. The file
-fills a row: vid2demo bench table --name retrieval --dataset DATASET --results moments=runs/moments.json
+DATASET is what `vid2demo synthesize bop` wrote; without one it is rendered to runs/tables first. Each mesh of its
+database is drawn in VIEWS silhouettes; a mask takes the mesh with the most alike one, by Hu's seven moments and the
+share of its least rectangle that it fills. The file fills a row:
+vid2demo bench table --name retrieval --dataset DATASET --results moments=runs/moments.json
 """
 
 from __future__ import annotations

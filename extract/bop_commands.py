@@ -48,7 +48,7 @@ class EvalBop(Command):
     """
 
     dataset: Positional[DatasetFolder]
-    results: Positional[Annotated[Path, arg(metavar="RESULTS.csv", help="Poses in BOP's csv; mesh and size_m may follow.")]]
+    results: Positional[Annotated[Path, arg(metavar="RESULTS.csv", help="Poses as BOP has them, or the authors'.")]]
     protocol: Annotated[Literal["official", "paper"], arg(help="The authors' code or the paper's text.")] = "official"
     split: Annotated[str | None, told("NAME", "Folder of the pictures. Default: test, val or train.")] = None
     meshes: Annotated[Path | None, told("DIR", "Where the results' meshes lie. Default: beside the results.")] = None
