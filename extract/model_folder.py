@@ -20,7 +20,7 @@ from .models import ModelCard
 
 FOLDER_VARIABLE = "VID2DEMO_MODELS"
 RECEIPT = "vid2demo.json"  # what `pull` leaves beside the weights: repository and revision
-FETCHED = ("*.json", "*.txt", "*.model", "model*.safetensors")
+FETCHED = ("*.json", "*.txt", "*.model", "model.safetensors", "model-*-of-*.safetensors")
 SAMPLE_BYTES = 1 << 16
 
 
@@ -38,7 +38,7 @@ def complaint(card: ModelCard, folder: Path) -> str | None:
         return None if (folder / card.checkpoint).is_file() else f"holds no {card.checkpoint}"
     if not (folder / "config.json").is_file():
         return "holds no config.json"
-    found = _json(folder / "config.json").get("model_type")
+    found = read_json(folder / "config.json").get("model_type")
     if found not in card.architectures:
         return f"holds a network of type {found!r}, not {' or '.join(map(repr, card.architectures))}"
     missing = [name for name in weight_files(folder) if not (folder / name).is_file()]
@@ -50,7 +50,7 @@ def weight_files(folder: Path) -> list[str]:
     index = folder / "model.safetensors.index.json"
     if not index.is_file():
         return ["model.safetensors"]
-    return sorted(set(_json(index).get("weight_map", {}).values())) or ["model.safetensors"]
+    return sorted(set(read_json(index).get("weight_map", {}).values())) or ["model.safetensors"]
 
 
 def find_folder(card: ModelCard, folder: Path | None = None) -> tuple[Path | None, str]:
@@ -84,7 +84,7 @@ def pull_command(card: ModelCard, folder: Path | None = None) -> str:
 def revision_of(card: ModelCard, folder: Path) -> str | None:
     """The commit that lies in a folder: what `pull` noted, else the card's."""
     receipt = folder / RECEIPT
-    noted = _json(receipt).get("revision") if receipt.is_file() else None
+    noted = read_json(receipt).get("revision") if receipt.is_file() else None
     return str(noted) if noted else card.revision
 
 
@@ -156,7 +156,8 @@ def _hub_cache(card: ModelCard) -> Path | None:
     return Path(found).parent if isinstance(found, str) else None
 
 
-def _json(path: Path) -> dict[str, Any]:
+def read_json(path: Path) -> dict[str, Any]:
+    """The JSON object in a file of a model's folder. Raises UserError when it is damaged."""
     try:
         value = json.loads(path.read_text(encoding="utf-8"))
     except (ValueError, OSError) as error:

@@ -6,7 +6,6 @@ or is hidden for a while keeps its place; only what is too small in the first fr
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import UserError
-from .model_folder import require_folder
+from .model_folder import read_json, require_folder
 from .models import model_card
 from .protocols import Box, Image, Mask, Proposal
 from .torch_models import Precision, described, load_network, load_processor, place
@@ -192,7 +191,7 @@ def _video_config(folder: Path) -> Any:
 
     config = Sam2VideoConfig.from_pretrained(folder, local_files_only=True)
     if not isinstance(config.mask_decoder_config, Sam2VideoMaskDecoderConfig):
-        stated = json.loads((folder / "config.json").read_text(encoding="utf-8")).get("mask_decoder_config") or {}
+        stated = read_json(folder / "config.json").get("mask_decoder_config") or {}
         config.mask_decoder_config = Sam2VideoMaskDecoderConfig(**stated)
     return config
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .model_folder import require_folder
+from .model_folder import read_json, require_folder
 from .models import model_card
 from .protocols import Floats, Image
 from .torch_models import Precision, described, load_network, load_processor, place
@@ -29,13 +30,13 @@ class NeuralWords:
         batch: int | None = None,
     ) -> None:
         """Load the network. batch: texts or pictures at once. Raises UserError when the weights are missing."""
-        from transformers import AutoImageProcessor, AutoModel, AutoTokenizer
+        from transformers import AutoImageProcessor, AutoModel
 
         card = model_card(model, "words")
         folder = require_folder(card, models_dir)
         self._placement = place(device, precision)
         self._network = load_network(AutoModel, card, folder, self._placement)
-        self._tokenizer = load_processor(AutoTokenizer, card, folder)
+        self._tokenizer = load_processor(_tokenizer_kind(folder), card, folder)
         self._images = load_processor(AutoImageProcessor, card, folder)
         # SigLIP has been trained on texts filled up to their full length, CLIP marks where a text ends.
         text = self._network.config.text_config
@@ -86,6 +87,16 @@ class NeuralWords:
             return np.zeros((0, self._size), np.float32)
         vectors = np.concatenate(found)
         return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True), np.float32)
+
+
+def _tokenizer_kind(folder: Path) -> Any:
+    """What reads a folder's tokenizer: SigLIP's own needs sentencepiece, without which its tokenizer.json does."""
+    from transformers import AutoTokenizer, PreTrainedTokenizerFast
+
+    stated = folder / "tokenizer_config.json"
+    siglip = stated.is_file() and read_json(stated).get("tokenizer_class") == "SiglipTokenizer"
+    plain = siglip and importlib.util.find_spec("sentencepiece") is None and (folder / "tokenizer.json").is_file()
+    return PreTrainedTokenizerFast if plain else AutoTokenizer
 
 
 def squared(image: Image) -> Image:

@@ -123,7 +123,8 @@ def _quietly() -> Iterator[None]:
 def load_processor(kind: Any, card: ModelCard, folder: Path) -> Any:
     """What prepares the input of a network, from its folder. Raises UserError when its files are missing."""
     try:
-        return kind.from_pretrained(folder, local_files_only=True, trust_remote_code=False)
+        with _quietly():
+            return kind.from_pretrained(folder, local_files_only=True, trust_remote_code=False)
     except Exception as error:  # as above
         raise UserError(f"{folder} lacks the pre-processing of {card.name} ({error}); fetch it again") from error
 

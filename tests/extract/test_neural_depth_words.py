@@ -92,6 +92,16 @@ def test_half_precision_of_words_is_close(tiny_models: Path, words: NeuralWords)
     assert np.sum(half.encode_images(pictures) * words.encode_images(pictures), axis=1).min() > 0.99
 
 
+def test_siglip_reads_words_without_sentencepiece(tiny_models: Path, tmp_path: Path) -> None:
+    """Its checkpoints ask for a tokenizer that needs that package; their tokenizer.json says the same."""
+    shutil.copytree(tiny_models / "siglip-base", tmp_path / "siglip-base")
+    path = tmp_path / "siglip-base/tokenizer_config.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"tokenizer_class": "SiglipTokenizer"}))
+    words = NeuralWords("siglip-base", models_dir=tmp_path, device="cpu")
+    plain = NeuralWords("siglip-base", models_dir=tiny_models, device="cpu")
+    np.testing.assert_array_equal(words.encode_texts(["a photo of a mug"]), plain.encode_texts(["a photo of a mug"]))
+
+
 def test_pictures_are_made_square_not_cut() -> None:
     tall = squared(np.full((40, 10, 3), 200, np.uint8))
     assert tall.shape == (40, 40, 3)

@@ -55,6 +55,16 @@ def test_a_batch_gives_what_single_crops_give(encoder: NeuralPatchFeatures) -> N
     assert encode(encoder, crops[:0])[0].shape == (0, GRID, GRID, encoder.patch_size)
 
 
+def test_never_more_crops_go_through_at_once_than_the_batch_says(encoder: NeuralPatchFeatures) -> None:
+    """What bounds the memory: seen from inside the network, when more are asked for."""
+    seen: list[int] = []
+    hook = encoder._network.register_forward_pre_hook(lambda _, inputs: seen.append(len(inputs[0])))
+    encode(encoder, crops_for(encoder, 7))
+    hook.remove()
+    assert seen == [2, 2, 2, 1]
+    assert place("cpu").batch == 8
+
+
 def test_patches_come_row_by_row(encoder: NeuralPatchFeatures) -> None:
     """A change of the picture in one patch moves that patch's features most."""
     crops = np.full((1, encoder.crop_px, encoder.crop_px, 3), 120, np.uint8)
