@@ -4,8 +4,9 @@
 
 Everything starts from exact tracks of synthetic pours, which are rendered small once into --clips. `solve`: error of
 the plan to the true motion, where the track is exact and where a tracker trembles by 0.5 mm and 0.2 degrees; largest
-torque beyond gravity's, largest jerk. `weights`: what w_d trades. `execute`: the controller's errors over the whole
-motion, with liquid. `time`: one core's time for 250 knots, inverse kinematics included.
+torque beyond gravity's, largest jerk. `weights`: what w_d trades. `execute`: with what `--scale auto` chose, the
+controller's errors over the whole motion, and what was poured. `time`: one core's time for 250 knots, inverse
+kinematics included.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,7 @@ from vid2demo.demos.motion import JointCurve
 from vid2demo.demos.optimize import TorqueWeights
 from vid2demo.demos.retarget import Solver, retarget, tracking_errors
 from vid2demo.demos.rollout import DEFAULT_ENV_ID, make_env, roll_out
+from vid2demo.demos.scale_search import search_scale
 from vid2demo.envs.placement import build_reference
 from vid2demo.envs.reference import Reference
 from vid2demo.extract.geometry import Array
@@ -37,15 +39,18 @@ CATEGORIES = ("mug", "gooseneck_kettle", "bottle", "tumbler", "teapot", "jug", "
 TREMBLE_M, TREMBLE_RAD = 5e-4, np.deg2rad(0.2)
 
 
-def references(clips: Path, count: int) -> Iterator[tuple[str, Reference]]:
-    """Seeded pours of eight categories, placed before the robot."""
+Pour = tuple[str, Reference, Callable[[float], Reference]]
+
+
+def references(clips: Path, count: int) -> Iterator[Pour]:
+    """Seeded pours of eight categories, placed before the robot, and how to place them at another scale."""
     for seed in range(count):
         category = CATEGORIES[seed % len(CATEGORIES)]
         folder = clips / f"{seed:02d}_{category}"
         if not (folder / "truth.track.npz").exists():
             synthesize(category, seed, folder, size=(96, 72), occluder=False, noise=False)
         tracks = [ObjectTrack.load(folder / f"{name}.track.npz") for name in ("truth", "receptacle")]
-        yield folder.name, build_reference(tracks[0], tracks[1])
+        yield folder.name, build_reference(*tracks), lambda scale, t=tracks: build_reference(*t, scale=scale)  # type: ignore[misc]
 
 
 def trembling(reference: Reference, rng: np.random.Generator) -> Reference:
@@ -86,19 +91,19 @@ def mean_of(rows: list[dict[str, float]]) -> dict[str, float]:
     return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
 
 
-def table_solve(pours: list[tuple[str, Reference]]) -> list[dict[str, Any]]:
+def table_solve(pours: list[Pour]) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
     for track in ("exact", "trembling"):
         for solver in ("mink", "torque"):
             found = []
-            for number, (_, truth) in enumerate(pours):
+            for number, (_, truth, _) in enumerate(pours):
                 seen = truth if track == "exact" else trembling(truth, np.random.default_rng(number))
                 found.append(solved(truth, seen, solver))  # type: ignore[arg-type]
             rows.append({"track": track, "solver": {"mink": "mink alone", "torque": "Eq. 4"}[solver], **mean_of(found)})
     return rows
 
 
-def table_weights(pours: list[tuple[str, Reference]]) -> list[dict[str, Any]]:
+def table_weights(pours: list[Pour]) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
     for factor in (0.01, 0.1, 1.0, 10.0):
         plain = TorqueWeights()
@@ -107,16 +112,17 @@ def table_weights(pours: list[tuple[str, Reference]]) -> list[dict[str, Any]]:
         )
         for track in ("exact", "trembling"):
             found = []
-            for number, (_, truth) in enumerate(pours):
+            for number, (_, truth, _) in enumerate(pours):
                 seen = truth if track == "exact" else trembling(truth, np.random.default_rng(number))
                 found.append(solved(truth, seen, "torque", weights))
             rows.append({"w_d": weights.position_1_m2, "track": track, **mean_of(found)})
     return rows
 
 
-def table_execute(pours: list[tuple[str, Reference]], particles: int) -> list[dict[str, Any]]:
+def table_execute(pours: list[Pour], particles: int) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
-    for name, reference in pours:
+    for name, faithful, at_scale in pours:
+        reference = search_scale(faithful, at_scale)
         joints = retarget(reference, strict=False)
         findings = feasibility(reference, joints)
         env = make_env(
@@ -145,7 +151,7 @@ def table_execute(pours: list[tuple[str, Reference]], particles: int) -> list[di
                 "max_deg": float(np.rad2deg(rotation_rad.max())),
                 "limit_part": max(e.part for e in found if e.quantity != "torque rate"),
                 "collisions": len(findings["collisions"]),
-                "scale": reference.scale,
+                "changed": changed(reference),
                 "poured": episode.summary["poured_fraction"],
                 "spilled": episode.summary["spilled_fraction"],
             }
@@ -153,9 +159,16 @@ def table_execute(pours: list[tuple[str, Reference]], particles: int) -> list[di
     return rows
 
 
-def table_time(pours: list[tuple[str, Reference]]) -> list[dict[str, Any]]:
+def changed(reference: Reference) -> str:
+    """What `--scale auto` changed, in short."""
+    chosen = next(t for t in reference.header["scale_search"] if t["chosen"])
+    moved_cm = 100 * float(np.hypot(chosen["along_m"], chosen["across_m"]))
+    return f"x{chosen['scale']:.2f} {moved_cm:.0f}cm +{chosen['tip_deg']:.0f}deg"
+
+
+def table_time(pours: list[Pour]) -> list[dict[str, Any]]:
     rows = []
-    for name, reference in pours[:3]:
+    for name, reference, _ in pours[:3]:
         long = reference.stretched(249 / 25.0 / reference.duration_s)
         retarget(long)  # loads the libraries and compiles
         for solver in ("mink", "torque"):

@@ -32,8 +32,8 @@ def feasibility(reference: Reference, joints: JointTrajectory) -> dict[str, Any]
     `feasible`: tracking within 1 cm and 5 degrees, all limits of joints, gripper and payload kept, no collision.
     `limits`: where the motion comes nearest to each limit at 1 kHz, and the margin that is left of it. `phases`: errors
     before, in and after the pour. `changed`: from the video, in numbers. `variant`: for what is not feasible, the
-    nearest motion found that is, and how far that is away; None if there is none. `words`: all of it in plain
-    sentences. Raises ValueError when the two differ in length.
+    nearest motion found that is, and how far that is away; None if there is none. `scale_search`: what `--scale auto`
+    tried and what came of it. `words`: all of it in plain sentences. Raises ValueError when the two differ in length.
     """
     findings, problems = _findings(reference, joints)
     findings["feasible"] = not problems
@@ -76,6 +76,7 @@ def _findings(reference: Reference, joints: JointTrajectory) -> tuple[dict[str, 
         "gripper_width_m": float(grasp.get("width_m", 0.0)),
         "caught_part_of_jet": reference.header.get("feasibility", {}).get("caught_part_of_jet"),
         "changed": _changed(reference),
+        "scale_search": list(reference.header.get("scale_search", [])),
         "changes": reference.notes,
     }
     problems = _problems(findings, margin, speed_part, torque_part)

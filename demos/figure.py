@@ -47,7 +47,7 @@ def figure(folder: Path, times_s: Sequence[float] | None = None, columns: int = 
     start_s, end_s = float(reference.video_time_s[0]), float(reference.video_time_s[-1])
     if times_s is None and not 1 <= columns <= MAX_COLUMNS:
         raise UserError(f"{columns} columns make no figure; choose 1 to {MAX_COLUMNS}")
-    at_s: Array = np.linspace(start_s, end_s, columns) if times_s is None else np.asarray(times_s, float)
+    at_s = np.array(np.linspace(start_s, end_s, columns) if times_s is None else times_s, np.float64)
     if not 1 <= len(at_s) <= MAX_COLUMNS or not np.all((at_s >= start_s - 1e-6) & (at_s <= end_s + 1e-6)):
         raise UserError(
             f"the times must be 1 to {MAX_COLUMNS} from {start_s:.2f} to {end_s:.2f} s of the video, got "

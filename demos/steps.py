@@ -5,11 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from ..extract.files import write_json
 from ..extract.progress import Progress
 from ..extract.stages import Stage, plain
+
+if TYPE_CHECKING:
+    from ..envs.reference import Reference
 
 ROOMS = ("extract", "envs", "demos")  # whose code decides what comes out here
 
@@ -36,6 +39,7 @@ def reference_stage(
 ) -> Stage:
     """NAME.track.npz (and the receptacle's) -> NAME.reference.npz. receptacle: a library vessel to stand there.
 
+    scale: "auto" takes what pours best in the simulator, if the faithful motion does not pour well.
     speed: of the motion over the video's.
     """
     output = reference_path(track, folder)
@@ -44,12 +48,18 @@ def reference_stage(
         from ..envs.placement import build_reference
         from ..extract.track import ObjectTrack
         from ..extract.vessels import make_vessel, resolve_category
+        from .scale_search import search_scale
 
         vessel = make_vessel(resolve_category(receptacle)[0]) if receptacle else None
         seen = ObjectTrack.load(receptacle_track) if receptacle_track else None
-        reference = build_reference(
-            ObjectTrack.load(track), seen, scale=scale, speed=speed, receptacle=vessel, seed=seed
-        )
+        moved = ObjectTrack.load(track)
+
+        def build(wanted: float | Literal["auto"]) -> Reference:
+            return build_reference(moved, seen, scale=wanted, speed=speed, receptacle=vessel, seed=seed)
+
+        reference = build(scale)
+        if scale == "auto":
+            reference = search_scale(reference, build, progress)
         reference.save(output)
         return {
             "knots": len(reference),
@@ -65,7 +75,7 @@ def reference_stage(
         {"scale": scale, "speed": speed, "seed": seed, "receptacle": receptacle},
         {"track": track} | ({"receptacle track": receptacle_track} if receptacle_track else {}),
         (output.name,),
-        ("extract", "envs"),
+        ROOMS,
     )
 
 
