@@ -10,6 +10,8 @@ from tyro.conf import Positional, arg
 
 from .bop_commands import BenchTable, EvalBop, SynthesizeBop
 from .command import Box, Category, Command, Commands, MeshUnit, Receiver, Result, Seed, Staged, told
+from .mesh_commands import COMMANDS as MESH_COMMANDS
+from .mesh_commands import MeshName
 from .models_commands import COMMANDS as MODELS_COMMANDS
 
 if TYPE_CHECKING:
@@ -18,7 +20,6 @@ if TYPE_CHECKING:
 MeshUp = Annotated[
     Literal["auto", "+x", "-x", "+y", "-y", "+z", "-z"], arg(help="Axis of --mesh that points out of its opening.")
 ]
-MeshName = Positional[Annotated[str | None, arg(metavar="NAME", help="A category of the library or a word for one.")]]
 MeshSeed = Annotated[int | None, told("N", "A seeded variant [integer]. Default: the nominal one.")]
 
 
@@ -104,35 +105,6 @@ class CompareTrack(Command):
 
 
 @dataclass(frozen=True, kw_only=True)
-class MeshesList(Command):
-    """List the categories of the library with the measures of each.
-
-    For example: vid2demo meshes list
-    """
-
-    def do(self) -> Result:
-        from .catalogue import list_categories
-
-        return list_categories()
-
-
-@dataclass(frozen=True, kw_only=True)
-class MeshesShow(Command):
-    """Show a vessel's measures and its parameters with their ranges.
-
-    For example: vid2demo meshes show mug --seed 3
-    """
-
-    name: MeshName = None
-    seed: MeshSeed = None
-
-    def do(self) -> Result:
-        from .catalogue import describe
-
-        return describe(self.name, self.seed)
-
-
-@dataclass(frozen=True, kw_only=True)
 class MeshesExport(Command):
     """Write a vessel's mesh, in m, and its description to a folder.
 
@@ -176,8 +148,7 @@ class Synthesize(Staged):
 COMMANDS: Commands = {
     "extract": Extract,
     "compare-track": CompareTrack,
-    "meshes list": MeshesList,
-    "meshes show": MeshesShow,
+    **MESH_COMMANDS,
     "meshes export": MeshesExport,
     "synthesize": Synthesize,
     "synthesize bop": SynthesizeBop,

@@ -9,7 +9,10 @@ HOG (Dalal and Triggs, 2005): colours of a stored mesh and of a real object seld
 from __future__ import annotations
 
 import functools
+import re
+from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -159,15 +162,50 @@ def unit(vectors: Floats) -> Floats:
     return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12), np.float32)
 
 
-def make_features(name: str, options: dict[str, str] | None = None) -> PatchFeatures:
-    """The encoder of a name: "classical", or a model that `vid2demo models list` shows.
+def make_features(name: str, options: Mapping[str, str] | None = None) -> PatchFeatures:
+    """The encoder of a name: "classical", or a network for features that `vid2demo models list` shows.
 
-    options: for models, such as the folder of their weights.
+    options: of a network: models_dir, device, and block, after which tokens are taken.
     Raises UserError for an unknown name and when weights are missing.
     """
     if name == "classical":
         return ClassicalFeatures()
-    raise UserError(f"unknown patch features {name!r}; there is classical")
+    from .choose import choose
+    from .models import cards_for
+
+    if name not in (known := [card.name for card in cards_for("features")]):
+        raise UserError(f"unknown patch features {name!r}; there are classical, {', '.join(known)}")
+    chosen = dict(options or {})
+    models_dir, device = chosen.pop("models_dir", None), chosen.pop("device", "auto")
+    made: PatchFeatures = choose(
+        "features",
+        ClassicalFeatures,
+        level="foundation",
+        models=(name,),
+        models_dir=Path(models_dir) if models_dir else None,
+        device=device,
+        options={key: int(value) for key, value in chosen.items()},
+    ).made
+    return made
+
+
+def features_of(encoder: str, options: Mapping[str, str] | None = None) -> PatchFeatures:
+    """The encoder that a database was made with, by the name it wrote there.
+
+    Raises UserError when there is no such encoder here, or only with other weights.
+    """
+    if encoder == ClassicalFeatures().name:
+        return ClassicalFeatures()
+    from .models import cards_for
+
+    model = next((card.name for card in cards_for("features") if encoder.startswith(card.name)), None)
+    if model is None:
+        raise UserError(f"the database's features {encoder!r} are not known to this version; onboard its meshes again")
+    block = re.search(r"-block(\d+)-", encoder)
+    made = make_features(model, {**(options or {}), **({"block": block[1]} if block else {})})
+    if made.name != encoder:
+        raise UserError(f"the database was made with {encoder}, here is {made.name}; use those weights and that device")
+    return made
 
 
 def usual_descriptor(encoder: str) -> str:

@@ -1,7 +1,8 @@
 """What a folder of meshes holds: which files are objects, what each is called and what it is.
 
 Understood are Objaverse's folders (GLBs named by their uid, LVIS categories in `lvis-annotations.json.gz`), Google
-Scanned Objects (NAME/meshes/model.obj, category in `metadata.pbtxt`), folders named by category, and flat folders.
+Scanned Objects (NAME/meshes/model.obj, category in `metadata.pbtxt`), folders named by category, flat folders, and
+lists (`database.json`: name, category and file of each).
 """
 
 from __future__ import annotations
@@ -60,6 +61,8 @@ def find_sources(folder: Path, category: str | None = None) -> list[MeshSource]:
 
     Raises UserError when there is no mesh file in it.
     """
+    if (listed := folder / "database.json").is_file():
+        return _listed(listed)
     if not folder.is_dir():
         raise UserError(f"{folder} is no folder; give one with {', '.join(SUFFIXES)} files, or the word {LIBRARY!r}")
     files = sorted(p for p in folder.rglob("*") if p.suffix.lower() in SUFFIXES and p.is_file())
@@ -91,6 +94,21 @@ def _source(path: Path, root: Path, of_uid: Mapping[str, str], category: str | N
     else:
         found = _from_name(name)
     return MeshSource(name, category if category is not None else found.replace(" ", "_"), str(path))
+
+
+def _listed(file: Path) -> list[MeshSource]:
+    """Objects of a `database.json`, as `vid2demo synthesize bop` writes it beside a data set."""
+    try:
+        entries = json.loads(file.read_text("utf-8"))
+        found = []
+        for entry in entries:
+            path = str((file.parent / entry["file"]).resolve())
+            if vessel := entry.get("library"):
+                path = f"{LIBRARY}/{vessel['category']}/{int(vessel['seed'])}"
+            found.append(MeshSource(str(entry["name"]), str(entry["category"]), path))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise UserError(f"{file} is no list of meshes ({error}); each needs name, category and file") from error
+    return found
 
 
 def _from_name(name: str) -> str:

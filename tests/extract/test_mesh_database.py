@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from vid2demo.cli import main
 from vid2demo.extract.errors import UserError
 from vid2demo.extract.mesh_sources import find_sources, library_sources
 from vid2demo.extract.mesh_store import MeshStore, mesh_key
@@ -231,3 +232,32 @@ def test_textures_of_scanned_objects_are_found_beside_the_mesh(tmp_path: Path) -
     (folder / "model.obj").write_text("\n".join(lines))
     colors = read_source(find_sources(tmp_path)[0]).mesh.colors
     np.testing.assert_allclose(colors, np.tile([200, 30, 40], (len(colors), 1)), atol=2)
+
+
+def test_the_commands_tell_what_is_in_a_database(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_boxes(tmp_path / "in" / "crate", 2)
+    (tmp_path / "in" / "torn.obj").write_text("v 0 0\n")
+    words = ["meshes", "onboard", str(tmp_path / "in"), "--out", str(tmp_path / "db"), "--views", "6"]
+    assert main(words) == 1  # one was left out
+    assert "left out: torn" in capsys.readouterr().out
+    database = ["--db", str(tmp_path / "db")]
+    assert main(["meshes", "list", *database]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[:2] for line in lines] == [["box_0", "crate"], ["box_1", "crate"]]
+    assert all("0.100 x 0.0" in line and "6 views" in line and "box_" in line.split()[-1] for line in lines)
+    assert main(["meshes", "show", "box_1", *database, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["extents_m"] == pytest.approx([0.1, 0.06, 0.03])
+    assert main(["meshes", "show", "crate", *database]) == 2
+    assert "box_0, box_1" in capsys.readouterr().err
+    assert main(["meshes", "check", *database]) == 0
+    store = MeshStore.open(tmp_path / "db")
+    first, second = (store.views_folder / k[:2] / f"{k}.npy" for k in store.index().keys)
+    shutil.copy(first, second)
+    assert main(["meshes", "check", *database]) == 1
+
+
+def test_the_library_needs_no_database(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["meshes", "list"]) == 0
+    assert "gooseneck kettle" in capsys.readouterr().out.replace("_", " ")
+    assert main(["meshes", "show", "mug", "--seed", "3"]) == 0
+    assert "mug" in capsys.readouterr().out
