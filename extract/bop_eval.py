@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -121,17 +121,16 @@ def evaluate(
     by_image: dict[ImageKey, list[Estimate]] = defaultdict(list)
     for estimate in estimates:
         by_image[estimate.image].append(estimate)
-    shape = _shapes(dataset, tuple(folders))
+    shapes = _Shapes(dataset, folders)
     found: dict[str, list[NDArray[np.bool_]]] = {metric: [] for metric in METRICS}
     of_object: list[int] = []
     pairs: list[tuple[Estimate, TrueObject]] = []
+    off_percent: list[float] = []
     for done, (image, truths) in enumerate(sorted(wanted.items()), start=1):
         camera, size_px = dataset.camera_matrix(image), dataset.size_px(image)
-        true = [Placed(shape(t.obj_id, None, None), t.T_camera_object, camera, size_px, protocol) for t in truths]
+        true = [Placed(shapes.own(t.obj_id), t.T_camera_object, camera, size_px, protocol) for t in truths]
         of_image = by_image[image]
-        placed = [
-            Placed(shape(e.obj_id, e.mesh, e.size_m), e.T_camera_object, camera, size_px, protocol) for e in of_image
-        ]
+        placed = [Placed(shapes.of(e), e.T_camera_object, camera, size_px, protocol) for e in of_image]
         scores = np.array([e.score for e in of_image])
         of_object += [t.obj_id for t in truths]
         allowed = np.array([[_may_mean(e, t, protocol) for t in truths] for e in of_image], bool)
@@ -145,7 +144,9 @@ def evaluate(
             order = np.argsort(errors, axis=0) if metric == "cou" else order
             found[metric].append(recalls(errors, metric, protocol, scores, [t.obj_id for t in truths]))
             if metric == "cou":
-                pairs += [(of_image[k], truths[n]) for n, k in _meant(errors)]
+                meant = _meant(errors)
+                pairs += [(of_image[k], truths[n]) for n, k in meant]
+                off_percent += [100 * abs(placed[k].shape.size_m / true[n].shape.size_m - 1) for n, k in meant]
         if progress is not None:
             progress(done, len(wanted), "judging")
     right = {metric: np.concatenate([np.zeros((10, 0), bool), *found[metric]], axis=1) for metric in METRICS}
@@ -163,7 +164,7 @@ def evaluate(
         len(estimates),
         len(wanted),
         len(pairs),
-        _median([100 * abs(_size(e, shape) / shape(t.obj_id, None, None).size_m - 1) for e, t in pairs]),
+        _median(off_percent),
         **_of_own_models([(e, t) for e, t in pairs if e.mesh is None and e.obj_id == t.obj_id], dataset),
         category_percent=_right_category(pairs, dataset.root),
         seconds_per_image=float(np.mean(list(times.values()))) if times else None,
@@ -205,21 +206,23 @@ def find_mesh(name: str, folders: Sequence[Path]) -> Any:
     )
 
 
-def _shapes(dataset: Dataset, folders: tuple[Path, ...]) -> Callable[[int, str | None, float | None], Shape]:
-    @cache
-    def unsized(name: str) -> Any:
-        return find_mesh(name, folders)
+class _Shapes:
+    """The shapes of a data set's models, and of other meshes that estimates name, of which only the last are kept."""
 
-    @cache
-    def shape(obj_id: int, mesh: str | None, size_m: float | None) -> Shape:
-        if mesh is not None:
-            return Shape.of(unsized(mesh), size_m)
-        if obj_id not in dataset.models:
-            raise UserError(f"the results tell of object {obj_id}, of which {dataset.root} has no model")
-        return Shape.of(dataset.mesh(obj_id))
+    def __init__(self, dataset: Dataset, folders: Sequence[Path]) -> None:
+        self._dataset = dataset
+        self.own = cache(self._own)
+        self._unsized = lru_cache(maxsize=32)(lambda name: find_mesh(name, folders))
+        self._other = lru_cache(maxsize=64)(lambda name, size_m: Shape.of(self._unsized(name), size_m))
 
-    # The object id says nothing of another mesh, and would only spoil the cache.
-    return lambda obj_id, mesh, size_m: shape(0 if mesh is not None else obj_id, mesh, size_m)
+    def of(self, estimate: Estimate) -> Shape:
+        """What an estimate is a pose of."""
+        return self.own(estimate.obj_id) if estimate.mesh is None else self._other(estimate.mesh, estimate.size_m)
+
+    def _own(self, obj_id: int) -> Shape:
+        if obj_id not in self._dataset.models:
+            raise UserError(f"the results tell of object {obj_id}, of which {self._dataset.root} has no model")
+        return Shape.of(self._dataset.mesh(obj_id))
 
 
 def _may_mean(estimate: Estimate, truth: TrueObject, protocol: Protocol) -> bool:
@@ -268,10 +271,6 @@ def _meant(errors: Array) -> list[tuple[int, int]]:
     return [(n, int(k)) for n, k in enumerate(best) if errors[k, n] <= 1 - SAME_OBJECT_IOU]
 
 
-def _size(estimate: Estimate, shape: Callable[[int, str | None, float | None], Shape]) -> float:
-    return estimate.size_m if estimate.size_m is not None else shape(estimate.obj_id, None, None).size_m
-
-
 def _of_own_models(pairs: Sequence[tuple[Estimate, TrueObject]], dataset: Dataset) -> dict[str, float | None]:
     """ADD-S and geodesic errors, which need the same mesh on both sides."""
     if not pairs:
@@ -298,10 +297,11 @@ def _right_category(pairs: Sequence[tuple[Estimate, TrueObject]], root: Path) ->
     true = read_json(root / CATEGORIES_FILE)
     known: dict[str, str] = {}
     for entry in read_json(root / DATABASE_FILE):
-        known |= {entry["name"]: entry["category"], entry["file"]: entry["category"]}
+        known[entry["name"]] = entry["category"]
         if "library" in entry:
             known["library:{category}:{seed}".format(**entry["library"])] = entry["category"]
-    return float(100 * np.mean([known.get(mesh) == true[str(obj_id)] for mesh, obj_id in told]))
+    named = [(mesh if mesh in known else Path(mesh).stem, true[str(obj_id)]) for mesh, obj_id in told]
+    return float(100 * np.mean([known.get(name) == category for name, category in named]))
 
 
 def _some_points(mesh: Any) -> Array:
