@@ -17,7 +17,7 @@ import numpy as np
 
 from .demos.joints import JointTrajectory
 from .demos.page_style import SCRIPT, STYLE
-from .demos.plots import Line, Mark, chart, joint_rows
+from .demos.plots import Line, Mark, chart, motion_rows
 from .envs.reference import Reference
 from .extract.errors import UserError
 from .extract.files import write_text
@@ -278,11 +278,7 @@ def _robot_plots(found: Found) -> str:
         if flows:
             parts.append(chart(f"contents of the {found.name}", "%", time_s, flows, limits=(0.0, 100.0), clock=clock))
     if found.joints is not None:
-        from .envs.panda import Q_MAX_RAD, Q_MIN_RAD
-
-        q_rad, at = found.joints.q_rad, found.joints.time_s
-        says = "joints between their limits"
-        parts.append(joint_rows(says, at, q_rad, np.asarray(Q_MIN_RAD), np.asarray(Q_MAX_RAD), clock=clock))
+        parts.append(motion_rows(found.joints, clock=clock))
     else:
         parts.append(_missing(f"{found.name}.joints.npz", "retarget"))
     return "".join(parts)
@@ -359,6 +355,7 @@ def _tables(found: Found) -> str:
     tables = (
         ("Stages", stages),
         ("Objects", meshes),
+        ("Pours tried", {str(k + 1): _try_words(t) for k, t in enumerate(found.feasibility.get("scale_search") or [])}),
         ("Dataset", dataset),
         ("Settings", _flat(found.record.get("settings") or {})),
         ("Video", _flat(found.record.get("video") or {})),
@@ -370,6 +367,13 @@ def _tables(found: Found) -> str:
         cells = "".join(f"<tr><th>{escape(k)}</th><td>{escape(_text(v))}</td></tr>" for k, v in rows.items())
         parts.append(f"<table><caption>{caption}</caption>{cells}</table>" if cells else "")
     return "".join(parts)
+
+
+def _try_words(tried: Mapping[str, Any]) -> str:
+    moved_cm = 100 * math.hypot(tried["along_m"], tried["across_m"])
+    what = f"scale {tried['scale']:.2f}, receptacle moved {moved_cm:.0f} cm, tipped {tried['tip_deg']:.0f}° further"
+    came = f"{100 * tried['poured']:.0f}% poured, {100 * tried['spilled']:.0f}% spilled"
+    return f"{what}: {came}{' (chosen)' if tried['chosen'] else ''}"
 
 
 def _missing(what: str, stage: str) -> str:

@@ -11,11 +11,15 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..extract.geometry import Array
+
+if TYPE_CHECKING:
+    from .joints import JointTrajectory
 
 WIDTH, HEIGHT = 460.0, 230.0
 _LEFT, _RIGHT, _TOP, _BOTTOM = 50.0, 12.0, 10.0, 34.0
@@ -96,9 +100,22 @@ def chart(
     return _figure(title, unit, parts, HEIGHT, time_s, [(li.label, li.color, li.value) for li in lines], clock)
 
 
-def joint_rows(title: str, time_s: Array, q_rad: Array, low_rad: Array, high_rad: Array, *, clock: str = "") -> str:
-    """A figure with one row for each joint: its way (N, J) inside the band between its limits, in rad."""
-    row, count = 40.0, q_rad.shape[1]
+def joint_rows(
+    title: str,
+    time_s: Array,
+    value: Array,
+    low: Array,
+    high: Array,
+    *,
+    unit: str = "°",
+    factor: float = 180.0 / math.pi,
+    clock: str = "",
+) -> str:
+    """A figure with one row for each joint: its value (N, J) inside the band between its limits (J,).
+
+    unit, factor: what is shown, and how much of it one of the value is; degrees of radians by default.
+    """
+    row, count = 40.0, value.shape[1]
     height = _TOP + row * count + _BOTTOM
     start, end = float(time_s[0]), max(float(time_s[-1]), float(time_s[0]) + 1e-6)
 
@@ -108,18 +125,35 @@ def joint_rows(title: str, time_s: Array, q_rad: Array, low_rad: Array, high_rad
     parts = _time_axis(x, start, end, height)
     for j in range(count):
         top = _TOP + row * j + 3
-        part = (q_rad[:, j] - low_rad[j]) / (high_rad[j] - low_rad[j])
-        margin = math.degrees(float(np.minimum(q_rad[:, j] - low_rad[j], high_rad[j] - q_rad[:, j]).min()))
+        part = (value[:, j] - low[j]) / (high[j] - low[j])
+        margin = factor * float(np.minimum(value[:, j] - low[j], high[j] - value[:, j]).min())
         parts.append(f'<rect class="band" x="{_LEFT}" y="{top}" width="{WIDTH - _LEFT - _RIGHT}" height="{row - 6}"/>')
         parts.append(f'<text class="tick" x="{_LEFT - 8}" y="{top + 21}" text-anchor="end">joint {j + 1}</text>')
         d = _path(x(time_s), top + (1 - np.clip(part, -0.05, 1.05)) * (row - 6))
         parts.append(f'<path class="line" style="stroke:var(--line-1)" d="{d}"/>')
-        text = f"{margin:.0f}° to the limit" if margin >= 0 else f"{-margin:.0f}° beyond the limit"
+        amount = f"{abs(margin):.{0 if abs(margin) >= 10 or unit == '°' else 1}f}{'' if unit == '°' else ' '}{unit}"
+        text = f"{amount} to the limit" if margin >= 0 else f"{amount} beyond the limit"
         near = part[len(part) * 3 // 5 :].mean() > 0.5
         at = top + (row - 12 if near else 11)
         parts.append(f'<text class="marklabel" x="{WIDTH - _RIGHT - 4}" y="{at}" text-anchor="end">{text}</text>')
-    data = [(f"joint {j + 1}", 1, np.rad2deg(q_rad[:, j])) for j in range(count)]
-    return _figure(title, "°", parts, height, time_s, data, clock, legend=False)
+    data = [(f"joint {j + 1}", 1, factor * value[:, j]) for j in range(count)]
+    return _figure(title, unit, parts, height, time_s, data, clock, legend=False)
+
+
+def motion_rows(joints: JointTrajectory, *, clock: str = "") -> str:
+    """Three figures of a joint motion: positions, speeds and torques between their limits."""
+    from .limits import LIMITS
+
+    degrees = 180.0 / math.pi
+    figures = []
+    for title, kind, value, unit, factor in (
+        ("joints between their limits", "position", joints.q_rad, "°", degrees),
+        ("their speeds", "speed", joints.dq_rad_s, "°/s", degrees),
+        ("their torques", "torque", joints.tau_nm, "N m", 1.0),
+    ):
+        low, high = LIMITS[kind].low, LIMITS[kind].high
+        figures.append(joint_rows(title, joints.time_s, value, low, high, unit=unit, factor=factor, clock=clock))
+    return "".join(figures)
 
 
 def ticks(low: float, high: float, count: int = 5) -> list[float]:

@@ -9,6 +9,7 @@ import pytest
 from vid2demo import cli
 from vid2demo.demos.figure import _LABEL_PX, _TITLE_PX, ROW_PX, figure, joint_plots
 from vid2demo.demos.joints import JointTrajectory
+from vid2demo.demos.plots import motion_rows
 from vid2demo.demos.simulate import PANEL_HEIGHT_PX, STRIP_HEIGHT_PX
 from vid2demo.envs.panda import Q_HOME_RAD, TAU_MAX_NM
 from vid2demo.envs.reference import Reference
@@ -109,3 +110,16 @@ def test_a_joint_beyond_its_limit_is_seen_beyond_it() -> None:
     changed = np.argwhere((plain != beyond).any(axis=2))
     assert changed[:, 0].min() > 6 * plain.shape[0] // 8
     assert changed[:, 1].min() > 2 * plain.shape[1] // 3
+
+
+def test_the_report_tells_what_is_left_to_each_limit() -> None:
+    time_s = np.arange(KNOTS) / HZ
+    q = np.tile(Q_HOME_RAD, (KNOTS, 1))
+    tau = np.zeros((KNOTS, 7))
+    tau[:, 1] = TAU_MAX_NM[1] - 12.0
+    tau[25, 6] = TAU_MAX_NM[6] + 2.5
+    html = motion_rows(JointTrajectory(time_s, q, np.zeros_like(q), tau, np.zeros(KNOTS)))
+    assert html.count("<figure") == 3
+    assert "12 N m to the limit" in html
+    assert "2.5 N m beyond the limit" in html
+    assert "125°/s to the limit" in html.replace("125 °/s", "125°/s")
