@@ -11,10 +11,12 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
 from .features import object_cells, unit
@@ -59,11 +61,27 @@ def stored_patches(store: MeshStore, key: str, features: PatchFeatures) -> NDArr
     return np.asarray(np.load(path, mmap_mode="r", allow_pickle=False))
 
 
-def view_scores(query: Floats, patches: NDArray[np.float16], cells: NDArray[np.bool_], over: Over) -> Floats:
+@functools.lru_cache(maxsize=256)
+def _covered_in(path: Path) -> NDArray[np.bool_]:
+    return covered_cells(np.load(path, mmap_mode="r", allow_pickle=False))
+
+
+def covered_cells(patches: NDArray[np.float16]) -> NDArray[np.bool_]:
+    """(M, G G) the cells in which views (M, G, G, D) show their object."""
+    return np.asarray(np.any(patches.reshape(len(patches), -1, patches.shape[-1]) != 0, axis=-1))
+
+
+def view_scores(
+    query: Floats,
+    patches: NDArray[np.float16],
+    cells: NDArray[np.bool_],
+    over: Over,
+    covered: NDArray[np.bool_] | None = None,
+) -> Floats:
     """(M, T) equation 1: the mean over patches of the cosine between queries (T, G, G, D) and views (M, G, G, D).
 
     over: "foreground": a query's cells (T, G, G); "union": cells that either covers, so that what sticks out counts
-    against a view; "all": every cell, as the authors' code does.
+    against a view; "all": every cell, as the authors' code does.  covered: of the views, when known (`covered_cells`).
     """
     turns, size = len(query), query.shape[-1]
     counted = cells.reshape(turns, -1) if over != "all" else np.ones((turns, cells[0].size), bool)
@@ -77,7 +95,7 @@ def view_scores(query: Floats, patches: NDArray[np.float16], cells: NDArray[np.b
         total[first : first + BATCH] = part.reshape(len(part), -1).astype(np.float32) @ wanted
     if over != "union":
         return np.asarray(total / counted.sum(axis=1))
-    covered = np.any(flat != 0, axis=-1)
+    covered = covered_cells(patches) if covered is None else covered
     either = covered.sum(axis=1)[:, None] + (~covered).astype(np.float32) @ counted.T.astype(np.float32)
     return np.asarray(total / np.maximum(either, 1.0))
 
@@ -126,7 +144,8 @@ def coarse_poses(
     look: one frame of the object.  size_m: its largest extent.
     """
     patches, visible = stored_patches(store, key, features), store.views(key)["visible"]
-    scores = view_scores(look.patches[0], patches, look.cells[0], over)
+    covered = _covered_in(store.patches(key)) if over == "union" else None
+    scores = view_scores(look.patches[0], patches, look.cells[0], over, covered)
     x, y, w, h = box_xywh_px
     ray = ray_rotation(camera_matrix, np.array([x + w / 2 - 0.5, y + h / 2 - 0.5]))
     back = Rotation.from_euler("z", -look.turns_rad[:, None]).as_matrix()
@@ -140,11 +159,19 @@ def coarse_poses(
     return guesses
 
 
-def fit_box(mesh_m: ColoredMesh, R: Array, t: Array, box_xywh_px: Box, camera_matrix: Array, rounds: int = 3) -> Array:
-    """(3,) the translation near t at which the mesh's projection has the box's centre and mean size."""
+def outermost(points: Array) -> Array:
+    """(K, 3) the corners of the convex hull of points (N, 3): they alone decide the box around a projection."""
+    try:
+        return np.asarray(points[ConvexHull(points).vertices])
+    except QhullError:  # flat, or next to it
+        return points
+
+
+def fit_box(points_m: Array, R: Array, t: Array, box_xywh_px: Box, camera_matrix: Array, rounds: int = 3) -> Array:
+    """(3,) the translation near t at which the projection of points (N, 3) has the box's centre and mean size."""
     x, y, w, h = box_xywh_px
     target = np.array([x + w / 2, y + h / 2])
-    turned = mesh_m.vertices @ R.T
+    turned = points_m @ R.T
     nearest = -float(turned[:, 2].min()) + 1e-3
     t = np.array(t, float)
     for _ in range(rounds):
@@ -187,11 +214,12 @@ def fine_poses(
     mesh_m: in metres.  extend: of the crops of the picture; those of the drawings are equal.
     """
     tried: list[PoseGuess] = []
+    corners = outermost(mesh_m.vertices)
     for guess in guesses:
         R, t = guess.T_camera_object[:3, :3], guess.T_camera_object[:3, 3]
         poses = []
         for candidate in rotations_near(R, within_rad=within_rad):
-            poses.append(make_pose(candidate, fit_box(mesh_m, candidate, t, box_xywh_px, camera_matrix)))
+            poses.append(make_pose(candidate, fit_box(corners, candidate, t, box_xywh_px, camera_matrix)))
         views = [view_crop(mesh_m, pose, camera_matrix, extend, features.crop_px) for pose in poses]
         scores = view_scores(look.patches[0, :1], _object_patches(features, views), look.cells[0, :1], over)[:, 0]
         tried += [PoseGuess(pose, float(score)) for pose, score in zip(poses, scores, strict=True)]

@@ -13,6 +13,7 @@ keys it holds, its rows are in the order of the keys, so that a row cannot come 
 from __future__ import annotations
 
 import fcntl
+import functools
 import hashlib
 import json
 import os
@@ -105,7 +106,16 @@ class Index:
 
     def about(self) -> list[About]:
         """What is known of every row."""
-        return [About.from_json(entry) for entry in json.loads((self.folder / "about.json").read_text("utf-8"))]
+        return [self.about_row(row) for row in range(len(self))]
+
+    def about_row(self, row: int) -> About:
+        """What is known of one row; the first call reads the list, which takes a moment in a large database."""
+        return About.from_json(self._entries[row])
+
+    @functools.cached_property
+    def _entries(self) -> list[dict[str, Any]]:
+        entries: list[dict[str, Any]] = json.loads((self.folder / "about.json").read_text("utf-8"))
+        return entries
 
 
 class MeshStore:
@@ -231,7 +241,7 @@ class MeshStore:
     def index(self) -> Index:
         """The index over what is stored now; rebuilt first when objects have come or gone."""
         keys = self.keys()
-        folder = self._index_folder(keys)
+        folder = self.index_folder(keys)
         if not folder.is_dir():
             self._build_index(keys, folder)
         columns = {name: np.load(folder / f"{name}.npy", mmap_mode="r", allow_pickle=False) for name in COLUMNS}
@@ -275,7 +285,8 @@ class MeshStore:
     def _views_file(self, key: str) -> Path:
         return self.views_folder / key[:2] / f"{key}.npy"
 
-    def _index_folder(self, keys: Sequence[str]) -> Path:
+    def index_folder(self, keys: Sequence[str]) -> Path:
+        """Where the columns over exactly these keys, which are in order, belong."""
         digest = hashlib.sha256("\n".join(keys).encode()).hexdigest()[:32]
         return self.views_folder / "index" / digest
 

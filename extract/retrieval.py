@@ -164,7 +164,7 @@ class Retriever:
         return sorted(hits, key=lambda hit: -hit.score)[:top]
 
     def _hit(self, row: int, score: float, view: int) -> Hit:
-        return Hit(self.index.keys[row], self.abouts[row], score, view)
+        return Hit(self.index.keys[row], self.index.about_row(row), score, view)
 
     def _rows(self, text: str | None) -> NDArray[np.int64]:
         if len(self.index) == 0:

@@ -9,6 +9,7 @@ from vid2demo.extract.coarse_pose import (
     coarse_poses,
     fine_poses,
     fit_box,
+    outermost,
     ray_rotation,
     rotations_near,
     stored_patches,
@@ -88,11 +89,12 @@ def test_a_view_is_turned_with_the_ray(pixel: tuple[float, float]) -> None:
 def test_the_box_places_the_mesh() -> None:
     rng = np.random.default_rng(3)
     points = rng.uniform(-0.1, 0.1, (200, 3))
-    mesh = ColoredMesh(points, np.zeros((0, 3), np.int32), np.zeros((200, 3), np.uint8))
     for R in super_fibonacci_rotations(5):
         truth = rng.uniform([-0.2, -0.15, 0.5], [0.2, 0.15, 1.2])
         box = box_of_points(project(CAMERA, points @ R.T + truth))
-        np.testing.assert_allclose(fit_box(mesh, R, np.array([0.0, 0.0, 0.6]), box, CAMERA, 12), truth, atol=2e-3)
+        np.testing.assert_allclose(
+            fit_box(outermost(points), R, np.array([0.0, 0.0, 0.6]), box, CAMERA, 12), truth, atol=2e-3
+        )
 
 
 def test_the_fine_stage_looks_only_nearby() -> None:
@@ -143,3 +145,14 @@ def test_a_vertex_projects_where_the_picture_shows_it(store: MeshStore) -> None:
     x, y, w, h = mask_box(seen(mesh, T).mask)
     found = box_of_points(project(CAMERA, transform_points(T, mesh.vertices)))
     np.testing.assert_allclose(found, (x, y, w, h), atol=1.5)
+
+
+def test_the_outermost_points_have_the_box_of_all() -> None:
+    points = np.random.default_rng(5).normal(size=(500, 3))
+    few = outermost(points)
+    assert len(few) < 200
+    for R in super_fibonacci_rotations(5):
+        turned = [p @ R.T + [0.0, 0.0, 9.0] for p in (points, few)]
+        np.testing.assert_allclose(*(box_of_points(project(CAMERA, p)) for p in turned), atol=1e-9)
+    flat = points * [1.0, 1.0, 0.0]
+    assert len(outermost(flat)) == 500

@@ -1,0 +1,236 @@
+"""How often the right category is retrieved, by which descriptor, and what a search costs.
+
+    OMP_NUM_THREADS=1 MUJOCO_GL=egl python bench/retrieval.py DATASET [--db DB] [--json]
+    OMP_NUM_THREADS=1 python bench/retrieval.py --cost [--objects 50000] [--json]
+
+DATASET is what `vid2demo synthesize bop` writes: its pictures show variants that its database does not hold. Objects
+are given by their visible masks. The database is made in DATASET/views when --db is not given. Beside the descriptors
+stand a blind guess and the moments of the silhouette alone. `--cost` fabricates a database of 50,000 objects of 600
+views (sparse files) and times opening and searching it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from vid2demo.extract.bop import open_dataset
+from vid2demo.extract.bop_pose import large_enough
+from vid2demo.extract.features import ClassicalFeatures, features_of
+from vid2demo.extract.mesh_sources import find_sources
+from vid2demo.extract.mesh_store import About, MeshStore
+from vid2demo.extract.onboarding import onboard
+from vid2demo.extract.protocols import Image, Mask, Proposal
+from vid2demo.extract.retrieval import Look, Retriever, look_at_object, vote
+from vid2demo.extract.segment import mask_box
+from vid2demo.extract.templates import ViewSettings, template_view
+
+CLEAR = 0.95  # visible share from which on an object counts as unhidden
+SEARCHES = 15
+
+
+def moments(mask: Mask) -> NDArray[np.float64]:
+    """(7,) logarithms of Hu's moments of a silhouette, which know neither place, size nor turn."""
+    hu = cv2.HuMoments(cv2.moments(mask.astype(np.uint8), binaryImage=True)).ravel()
+    return np.asarray(-np.sign(hu) * np.log10(np.abs(hu) + 1e-12))
+
+
+def by_moments(store: MeshStore, index_keys: tuple[str, ...]) -> Callable[[Mask], NDArray[np.float64]]:
+    """Scores of all objects by the view whose silhouette's moments are nearest."""
+    views = []
+    for key in index_keys:
+        mesh = store.mesh(key).mesh
+        views.append([moments(template_view(mesh, store.settings, k, 120).mask) for k in range(store.settings.count)])
+    table = np.array(views)
+    spread = table.reshape(-1, 7).std(axis=0)
+    return lambda mask: -np.linalg.norm((table - moments(mask)) / spread, axis=-1).min(axis=1)
+
+
+def rank(scores: NDArray[Any], categories: list[str], wanted: str) -> int:
+    """At which place, from 0, the wanted category first comes, categories in the order of their best object."""
+    order = list(dict.fromkeys(categories[k] for k in np.argsort(-scores, kind="stable")))
+    return order.index(wanted) if wanted in order else len(order)
+
+
+def accuracy(dataset_folder: Path, db: Path | None) -> dict[str, Any]:
+    """Shares of objects whose category comes first, and among the first five, by method."""
+    root = db or dataset_folder / "views"
+    if db is None:
+        onboard(find_sources(dataset_folder), root)
+    store = MeshStore.open(root)
+    features = features_of(store.encoder)
+    dataset = open_dataset(dataset_folder)
+    named = json.loads((dataset_folder / "categories.json").read_text("utf-8"))
+    seen: list[tuple[str, float, Mask, Look]] = []
+    seconds = 0.0
+    for image in dataset.images:
+        rgb: Image = dataset.rgb(image)
+        for there in dataset.objects(image):
+            mask = dataset.mask(image, there.index)
+            if mask is None or not mask.any() or not large_enough(Proposal(mask, mask_box(mask), 1.0)):
+                continue
+            start = time.process_time()
+            look = look_at_object(features, store.settings.extend, [(rgb, mask)])
+            seconds += time.process_time() - start
+            seen.append((named[str(there.obj_id)], float(there.visible_fraction or 0.0), mask, look))
+    retrievers = {column: Retriever(store, column) for column in ("summary", "average")}
+    categories = [about.category for about in retrievers["summary"].abouts]
+    keys = retrievers["summary"].index.keys
+
+    def by_views(column: str, best_views: int) -> Callable[[Mask, Look], NDArray[Any]]:
+        def scores(mask: Mask, look: Look) -> NDArray[Any]:
+            hits = retrievers[column].retrieve(look, top=len(keys), short_list=len(keys), best_views=best_views)
+            found = {hit.key: hit.score for hit in hits}
+            return np.array([found[key] for key in keys])
+
+        return scores
+
+    by_hu = by_moments(store, keys)
+    methods: dict[str, Callable[[Mask, Look], NDArray[Any]]] = {
+        "silhouette moments, nearest view": lambda mask, look: by_hu(mask),
+        "FFA, one descriptor an object": by_views("average", 0),
+        "FFA, best 2 views": by_views("average", 2),
+        "summary, one descriptor an object": by_views("summary", 0),
+        "summary, best view": by_views("summary", 1),
+        "summary, best 2 views (the default)": by_views("summary", 2),
+        "summary, best 25 views (the authors')": by_views("summary", 25),
+    }
+    clear = np.array([visible > CLEAR for _, visible, _, _ in seen])
+    known = sorted(set(categories))
+    share = np.array([categories.count(name) / len(categories) for name in known])
+    rows = [{"method": "chance", "top1": float((share**2).sum()), "top5": min(5 / len(known), 1.0)}]
+    for method, score in methods.items():
+        start = time.process_time()
+        ranks = np.array([rank(score(mask, look), categories, name) for name, _, mask, look in seen])
+        each_ms = 1e3 * (time.process_time() - start) / len(seen)
+        row: dict[str, Any] = {"method": method, "top1": float(np.mean(ranks == 0)), "top5": float(np.mean(ranks < 5))}
+        row |= {"top1_clear": float(np.mean(ranks[clear] == 0)), "top1_hidden": float(np.mean(ranks[~clear] == 0))}
+        rows.append(row | {"ms": each_ms})
+    return {
+        "objects_seen": len(seen),
+        "clear": int(clear.sum()),
+        "database": {"meshes": len(keys), "categories": len(known), "encoder": store.encoder},
+        "look_ms": 1e3 * seconds / len(seen),
+        "rows": rows,
+    }
+
+
+def fabricate(root: Path, objects: int, size: int) -> MeshStore:
+    """A database of sparse files: every record has its full length, hardly any of it is on the disk."""
+
+    class Wide(ClassicalFeatures):
+        patch_size = size  # type: ignore[assignment]
+        summary_size = size  # type: ignore[assignment]
+
+    store = MeshStore.create(root, ViewSettings(), Wide(name="classical-wide"))
+    for number in range(objects):
+        key = f"{number * 2654435761 % 2**32:08x}{number:056x}"
+        path = store.views_folder / key[:2] / f"{key}.npy"
+        path.parent.mkdir(exist_ok=True)
+        with open(path, "wb") as stream:
+            stream.truncate(store.dtype.itemsize + 128)
+    keys = store.keys()
+    folder = store.index_folder(keys)
+    folder.mkdir(parents=True)
+    rng = np.random.default_rng(0)
+    matrix = rng.standard_normal((objects, size), np.float32)
+    matrix /= np.linalg.norm(matrix, axis=1, keepdims=True)
+    for column in ("average", "summary"):
+        np.save(folder / f"{column}.npy", matrix)
+    about = asdict(About("thing", "things", "objaverse/glbs/thing.glb", (0.0,) * 3, 1.0, "m", (0.1, 0.1, 0.1), 1000))
+    (folder / "keys.json").write_text(json.dumps(keys))
+    (folder / "about.json").write_text(json.dumps([about] * objects))
+    return store
+
+
+def opening(root: Path) -> dict[str, float]:
+    """In a process of its own: seconds to open a database and its index, and what that adds to its memory in MB."""
+    before = resident_mb()
+    start = time.perf_counter()
+    retriever = Retriever(MeshStore.open(root))
+    opened = time.perf_counter() - start
+    names = time.perf_counter()
+    retriever.index.about_row(0)
+    read = time.perf_counter() - names
+    after = resident_mb()
+    return {"objects": len(retriever.index), "open_s": opened, "names_s": read, "added_mb": after - before, "mb": after}
+
+
+def resident_mb() -> float:
+    """What this process holds in memory now."""
+    text = Path("/proc/self/status").read_text()
+    return int(next(line.split()[1] for line in text.splitlines() if line.startswith("VmRSS"))) / 1024
+
+
+def median_ms(work: Callable[[], Any]) -> float:
+    took = []
+    for _ in range(SEARCHES):
+        start = time.perf_counter()
+        work()
+        took.append(time.perf_counter() - start)
+    return 1e3 * float(np.median(took))
+
+
+def cost(objects: int, size: int = 1024) -> dict[str, Any]:
+    """Opening and searching a large database; the bare product is of the same matrix, in memory."""
+    with tempfile.TemporaryDirectory() as folder:
+        fabricate(Path(folder) / "db", objects, size)
+        command = [sys.executable, __file__, "--opening", str(Path(folder) / "db")]
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+        retriever = Retriever(MeshStore.open(Path(folder) / "db"))
+        matrix = np.array(retriever.index.summary)
+        queries = np.ascontiguousarray(matrix[:30])
+        query = queries[0].copy()
+        bare = median_ms(lambda: matrix @ query)
+        return json.loads(done.stdout) | {
+            "bare_product_ms": bare,
+            "search_ms": median_ms(lambda: np.argpartition(-vote(retriever.index.summary, queries[:1]), 100)[:100]),
+            "search_30_frames_ms": median_ms(lambda: np.argpartition(-vote(retriever.index.summary, queries), 100)),
+        }
+
+
+def as_text(found: dict[str, Any]) -> str:
+    if "rows" not in found:
+        return "\n".join(f"{name:<22} {value:10.2f}" for name, value in found.items())
+    lines = [f"{found['objects_seen']} objects, {found['clear']} of them unhidden; {found['database']}"]
+    lines += [f"looking at one takes {found['look_ms']:.1f} ms"]
+    lines += [f"{'method':<40} {'top-1':>6} {'top-5':>6} {'unhidden':>9} {'hidden':>7} {'ms':>7}"]
+    for row in found["rows"]:
+        rest = ""
+        if "ms" in row:
+            rest = f" {100 * row['top1_clear']:>9.1f} {100 * row['top1_hidden']:>7.1f} {row['ms']:>7.1f}"
+        lines.append(f"{row['method']:<40} {100 * row['top1']:>6.1f} {100 * row['top5']:>6.1f}{rest}")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("dataset", type=Path, nargs="?")
+    parser.add_argument("--db", type=Path)
+    parser.add_argument("--cost", action="store_true")
+    parser.add_argument("--objects", type=int, default=50_000)
+    parser.add_argument("--opening", type=Path, help=argparse.SUPPRESS)
+    parser.add_argument("--json", action="store_true")
+    chosen = parser.parse_args()
+    if chosen.opening:
+        print(json.dumps(opening(chosen.opening)))
+        return
+    if not chosen.cost and chosen.dataset is None:
+        parser.error("name a data set that `vid2demo synthesize bop` made, or give --cost")
+    found = cost(chosen.objects) if chosen.cost else accuracy(chosen.dataset, chosen.db)
+    print(json.dumps(found, indent=2) if chosen.json else as_text(found))
+
+
+if __name__ == "__main__":
+    main()
