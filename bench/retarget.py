@@ -1,6 +1,6 @@
 """Inverse kinematics alone against torques by optimal control (Eq. 4), and both carried out in the simulator.
 
-    OMP_NUM_THREADS=1 MUJOCO_GL=egl python bench/retarget.py [--pours N] [--tables solve weights execute time] [--json]
+    OMP_NUM_THREADS=1 MUJOCO_GL=egl python bench/retarget.py [--pours N] [--tables solve ...] [--grasp NAME] [--json]
 
 Everything starts from exact tracks of synthetic pours, which are rendered small once into --clips. `solve`: error of
 the plan to the true motion, where the track is exact and where a tracker trembles by 0.5 mm and 0.2 degrees; largest
@@ -119,15 +119,13 @@ def table_weights(pours: list[Pour]) -> list[dict[str, Any]]:
     return rows
 
 
-def table_execute(pours: list[Pour], particles: int) -> list[dict[str, Any]]:
+def table_execute(pours: list[Pour], particles: int, grasp: str) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
     for name, faithful, at_scale in pours:
         reference = search_scale(faithful, at_scale)
         joints = retarget(reference, strict=False)
         findings = feasibility(reference, joints)
-        env = make_env(
-            DEFAULT_ENV_ID, reference, num_particles=particles, randomization="none", control_mode="joint_position"
-        )
+        env = make_env(DEFAULT_ENV_ID, reference, num_particles=particles, grasp=grasp, control_mode="joint_position")
         errors: list[tuple[float, float]] = []
         episode = roll_out(
             env,
@@ -193,6 +191,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--pours", type=int, default=20)
     parser.add_argument("--particles", type=int, default=100)
+    parser.add_argument("--grasp", choices=["weld", "friction"], default="weld")
     parser.add_argument("--clips", type=Path, default=Path("runs/bench_retarget"))
     parser.add_argument("--tables", nargs="+", default=["solve", "weights", "execute", "time"])
     parser.add_argument("--json", action="store_true")
@@ -201,7 +200,7 @@ def main() -> None:
     make = {
         "solve": lambda: table_solve(pours),
         "weights": lambda: table_weights(pours[:5]),
-        "execute": lambda: table_execute(pours, arguments.particles),
+        "execute": lambda: table_execute(pours, arguments.particles, arguments.grasp),
         "time": lambda: table_time(pours),
     }
     result = {}

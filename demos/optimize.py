@@ -5,6 +5,10 @@
 solved by Crocoddyl's feasibility-driven dynamic programming on Pinocchio's rigid-body dynamics of the arm, the vessel
 and its contents. Unlike inverse kinematics it sees the whole motion at once: it begins early what it could not do in
 time, and what the tracker trembles costs it torque.
+
+Limits of position, speed, acceleration and torque are soft barriers here. Jerk is no quantity of this problem: the
+weights on torque and acceleration keep it at a few percent of its limit. Whoever uses the motion checks all of them
+(`limits`, `check_trajectory`).
 """
 
 from __future__ import annotations
