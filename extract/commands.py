@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from .bop_commands import BenchTable, EvalBop, SynthesizeBop
+from .bench_commands import BenchPose, BenchTable
+from .bop_commands import EvalBop, SynthesizeBop
 from .command import Box, Category, Command, Commands, MeshUnit, Receiver, Result, Seed, Staged, told
 from .mesh_commands import COMMANDS as MESH_COMMANDS
 from .mesh_commands import MeshName
@@ -153,6 +154,7 @@ COMMANDS: Commands = {
     "synthesize": Synthesize,
     "synthesize bop": SynthesizeBop,
     "eval-bop": EvalBop,
+    "bench pose": BenchPose,
     "bench table": BenchTable,
     **MODELS_COMMANDS,
 }

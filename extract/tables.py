@@ -123,8 +123,11 @@ def _own_figures(row: Row, dataset: Dataset | None) -> dict[str, float]:
     if kind == "chance" and dataset is not None and (dataset.root / DATABASE_FILE).is_file():
         of_category = Counter(entry["category"] for entry in read_json(dataset.root / DATABASE_FILE))
         meshes = of_category.total()
-        missed = {k: np.mean([comb(meshes - n, k) / comb(meshes, k) for n in of_category.values()]) for k in (1, 5)}
-        return {"category_percent": 100 * (1 - float(missed[1])), "category_top5_percent": 100 * (1 - float(missed[5]))}
+        percent = []
+        for drawn in (1, min(5, meshes)):
+            missed = [comb(meshes - own, drawn) / comb(meshes, drawn) for own in of_category.values()]
+            percent.append(100 * (1 - float(np.mean(missed))))
+        return {"category_percent": percent[0], "category_top5_percent": percent[1]}
     if kind != "views":
         return {}
     R = super_fibonacci_rotations(int(count))
