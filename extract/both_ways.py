@@ -22,7 +22,7 @@ from .starting import WORKING_SIDE_PX, Start, resized
 from .video import Image, VideoInfo, iterate_backward, iterate_frames
 
 TRIAL_FRAMES = 15  # that rivals for the first pose are followed before one of them is taken
-TRIAL_MARGIN = 0.02  # of mean confidence, by which the one that looked worse at first must be better
+TRIAL_MARGIN = 0.1  # of mean confidence by the outline, by which the one that looked worse at first must be better
 
 
 @dataclass(frozen=True)
@@ -49,6 +49,7 @@ def settle_rivals(clip: Clip, starts: Sequence[Start]) -> list[Start]:
 
     Only what is turned far from the best and explains the start frame nearly as well is tried.
     """
+    sure: dict[int, list[float]] = {}
     trials = [[_begun(clip, start, k) for k in range(len(start.hypotheses))] for start in starts]
     if all(len(trial) == 1 for trial in trials):
         return list(starts)
@@ -60,7 +61,12 @@ def settle_rivals(clip: Clip, starts: Sequence[Start]) -> list[Start]:
         for trial in trials:
             for follower in trial if len(trial) > 1 else ():
                 follower.step(frame.rgb, frame.index - clip.start_index, TRIAL_FRAMES)
-    return [start.preferring(_surest(trial)) for start, trial in zip(starts, trials, strict=True)]
+                # Texture holds on to any shape: only the outline tells whether it is the right one.
+                sure.setdefault(id(follower), []).append(replace(follower.tracker.signs, rigid=0.0).confidence)
+    return [
+        start.preferring(_surest([float(np.mean(sure.get(id(follower), [0.0]))) for follower in trial]))
+        for start, trial in zip(starts, trials, strict=True)
+    ]
 
 
 def follow_both_ways(
@@ -149,8 +155,7 @@ def _begun(clip: Clip, start: Start, hypothesis: int = 0) -> Followed:
     return Followed.start(model.mesh, model.vessel, clip.camera_matrix, clip.rgb, mask, T, symmetry=model.symmetry)
 
 
-def _surest(trial: Sequence[Followed]) -> int:
-    """Which of the followers is to be kept: the first, unless another is surer by a margin."""
-    sure = [float(np.mean([e.confidence for e in f.estimates])) if f.estimates else 0.0 for f in trial]
+def _surest(sure: Sequence[float]) -> int:
+    """Which of the rivals is to be kept: the first, unless another is surer by a margin."""
     best = int(np.argmax(sure))
     return best if sure[best] > sure[0] + TRIAL_MARGIN else 0

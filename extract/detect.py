@@ -7,7 +7,7 @@ surroundings, by how much of it moved in the clip, and by how well a mask cut th
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from .first_pose import edge_score, silhouette_ious, upright_rotation
 from .geometry import Array, make_pose
+from .handled import Handled, find_handled, reach_from_border
 from .raster import render_depth
 from .region import TrackingMesh, edge_strength, extract_outline, mask_evidence, refine
 from .segment import Box, Mask, mask_box, mask_from_box
@@ -24,11 +25,15 @@ from .video import Image
 SEARCH_WIDTH_PX = 240
 DIRECTIONS = 8
 OUTLINE_POINTS = 64
-SIZES = tuple(0.16 * 1.22**k for k in range(8))  # longest side of the object over the longest side of the image
+SIZES = tuple(0.1 * 1.22**k for k in range(11))  # longest side of the object over the longest side of the image
 ELEVATIONS_DEG = (5.0, 18.0, 35.0)
 YAW_STEP_DEG = 15.0
 MOVED_LAB = 14.0  # colour change, in Lab units, that counts as motion
 LEAST_MERIT = 1.2
+MOVED_SHARE = 0.4  # of what is handled, least, where more than SOMETHING_MOVED of the picture moves
+SOMETHING_MOVED = 0.005
+EXPLAINED_WEIGHT = 2.0
+ON_THING = 0.6  # of a silhouette, least, for the thing to be its object
 REFINED = 8
 
 
@@ -39,18 +44,43 @@ class _Match:
     T_camera_object: Array
 
 
-def motion_since(first: Image, frames: Iterable[Image], every: int = 5, at_most: int = 40) -> Array:
-    """(H, W) share of later frames, in [0, 1], whose colour at a pixel differs from the first frame's."""
+@dataclass(frozen=True)
+class _Arm:
+    """What comes into the picture and what it holds, at searching size: how far it reaches, the thing and the arm."""
+
+    reach: NDArray[np.int32]
+    thing: Mask | None
+    arm: Mask | None
+
+    @staticmethod
+    def of(moving: Mask, held: Handled | None) -> _Arm:
+        reach, size = reach_from_border(moving), (moving.shape[1], moving.shape[0])
+        if held is None:
+            return _Arm(reach, None, None)
+        small = [
+            cv2.resize(m.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.5 for m in (held.thing, held.arm)
+        ]
+        return _Arm(reach, *small)
+
+    def explained(self, silhouette: Mask) -> float:
+        """Share, in [0, 1], that a silhouette explains of what is farther out than it begins, and of the thing."""
+        here = self.reach[silhouette & (self.reach > 0)]
+        beyond = self.reach >= np.percentile(here, 10) if len(here) else silhouette
+        share = np.count_nonzero(silhouette & beyond) / max(np.count_nonzero(silhouette | beyond), 1)
+        if self.thing is None or self.arm is None:
+            return float(share)
+        shown = silhouette & ~self.arm  # of what the hand hides nothing can be said
+        both = np.count_nonzero(shown & self.thing) / max(np.count_nonzero(shown | self.thing), 1)
+        return float(share + 2 * both) / 3
+
+
+def motion_since(first: Image, others: Sequence[Image]) -> Array:
+    """(H, W) share of other frames, in [0, 1], whose colour at a pixel differs from the first one's."""
     reference = _soft_lab(first)
-    changed, count = np.zeros(first.shape[:2]), 0
-    for index, rgb in enumerate(frames):
-        if index == 0 or index % every:
-            continue
+    changed = np.zeros(first.shape[:2])
+    for rgb in others:
         changed += np.linalg.norm(_soft_lab(rgb) - reference, axis=-1) > MOVED_LAB
-        count += 1
-        if count >= at_most:
-            break
-    return changed / max(count, 1)
+    return changed / max(len(others), 1)
 
 
 def find_object(
@@ -61,28 +91,36 @@ def find_object(
     *,
     handled: bool,
     taken: Sequence[Mask] = (),
+    labels: NDArray[np.uint8] | None = None,
 ) -> Box | None:
     """Box of the place that looks most like one of the meshes; None when nothing does.
 
     moved: from `motion_since`.  handled: the object is the one that is handled, so that it must have moved.
-    taken: masks of objects found before, which cannot be found again.
+    taken: masks of objects found before, which cannot be found again.  labels: of a `Background`, if there is one.
     """
     scale = SEARCH_WIDTH_PX / max(rgb.shape[:2])
     small = cv2.resize(rgb, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     small_camera = np.diag([scale, scale, 1.0]) @ camera_matrix
     edges = _edge_maps(np.asarray(small, np.uint8))
+    size = (small.shape[1], small.shape[0])
+    small_moved = np.asarray(cv2.resize(moved.astype(np.float32), size, interpolation=cv2.INTER_AREA), np.float32)
+    places = np.ones(small.shape[:2], bool)
+    if handled and small_moved.mean() > SOMETHING_MOVED:
+        # What stands still is clutter: its edges are no part of what is handled.
+        edges = edges * (cv2.dilate(small_moved, np.ones((5, 5), np.uint8)) > MOVED_SHARE)
+        places = small_moved > MOVED_SHARE
+    held = find_handled(rgb, labels) if handled and labels is not None else None
+    arm = _Arm.of(small_moved > MOVED_SHARE, held) if handled else None
     matches: list[_Match] = []
     for index, mesh in enumerate(meshes):
-        matches += _slide(index, mesh, edges, small_camera, small.shape[:2])
+        matches += _slide(index, mesh, edges, small_camera, places)
     matches.sort(key=lambda m: m.score, reverse=True)
 
-    size = (small.shape[1], small.shape[0])
-    small_moved = np.asarray(cv2.resize(moved.astype(np.float32), size), np.float32)
     small_taken = [cv2.resize(mask.astype(np.uint8), size) > 0 for mask in taken]
     lab = _soft_lab(np.asarray(small, np.uint8))
     judged: list[tuple[float, _Match]] = []
     for match in matches[:400]:
-        merit = _judge(match, meshes[match.mesh], small_camera, lab, small_moved, small_taken, handled)
+        merit = _judge(match, meshes[match.mesh], small_camera, lab, small_moved, small_taken, arm)
         judged.append((merit, match))
     judged.sort(key=lambda entry: entry[0], reverse=True)
 
@@ -106,8 +144,17 @@ def find_object(
         size_share = np.sqrt(np.hypot(box[2], box[3]) / max(rgb.shape[:2]))
         total = merit + size_share * (iou + edge_score(mesh, T, camera_matrix, strength))
         if total > best_merit:
-            best_merit, best_box = total, _grown(box, 0.03, rgb)
+            best_merit, best_box = total, _grown(mask_box(_with_thing(silhouette, held)), 0.03, rgb)
     return best_box
+
+
+def _with_thing(silhouette: Mask, held: Handled | None) -> Mask:
+    """A silhouette that is mostly on what is held, with what it misses of it: spouts, handles."""
+    if held is None or np.count_nonzero(held.thing & silhouette) < ON_THING * np.count_nonzero(silhouette & ~held.arm):
+        return silhouette
+    _, part = cv2.connectedComponents(held.thing.astype(np.uint8))
+    touched = np.unique(part[held.thing & silhouette])
+    return silhouette | (np.isin(part, touched) & held.thing)
 
 
 def _soft_lab(rgb: Image) -> NDArray[np.float32]:
@@ -133,10 +180,10 @@ def _edge_maps(rgb: Image) -> NDArray[np.float32]:
 
 
 def _slide(
-    index: int, mesh: TrackingMesh, edges: NDArray[np.float32], camera_matrix: Array, shape: tuple[int, ...]
+    index: int, mesh: TrackingMesh, edges: NDArray[np.float32], camera_matrix: Array, places: NDArray[np.bool_]
 ) -> list[_Match]:
-    """Best places of every template of one mesh."""
-    height, width = shape[0], shape[1]
+    """Best places of every template of one mesh, its centre where `places` (H, W) allow it."""
+    height, width = shape = places.shape
     centre = np.array([width / 2, height / 2])
     inverse = np.linalg.inv(camera_matrix)
     pad = int(0.5 * max(SIZES) * max(shape)) + 4
@@ -164,6 +211,7 @@ def _slide(
                 # A long outline that fits is better evidence than a short one: noise averages out with its root.
                 steps = np.linalg.norm(np.diff(outline.pixel, axis=0), axis=1)
                 evidence = float(np.sqrt(np.minimum(steps, 12.0).sum() / max(shape))) / len(outline)
+                total[~places] = -np.inf
                 for _ in range(2):
                     y, x = np.unravel_index(int(np.argmax(total)), total.shape)
                     placed = make_pose(R, inverse @ np.array([x, y, 1.0]) * depth)
@@ -179,9 +227,12 @@ def _judge(
     lab: NDArray[np.float32],
     moved: NDArray[np.float32],
     taken: Sequence[Mask],
-    handled: bool,
+    arm: _Arm | None,
 ) -> float:
-    """Edge score, plus how far the region's colours differ from the ring around it, plus the motion inside it."""
+    """Edge score, plus how far the region's colours differ from the ring around it; and for what is handled, more.
+
+    arm: for what is handled: it must have moved, and is all there is at the end of an arm.
+    """
     height, width = moved.shape
     window = render_depth(mesh.vertices_m, mesh.faces, match.T_camera_object, camera_matrix)
     if window is None:
@@ -200,7 +251,13 @@ def _judge(
     outside = np.bincount(code[ring], minlength=512) / max(np.count_nonzero(ring), 1)
     contrast = 1.0 - float(np.sqrt(inside * outside).sum())
     motion = float(moved[silhouette].mean())
-    return 1.5 * match.score + 0.5 * contrast + (0.6 * motion if handled else 0.0)
+    if arm is None:
+        return 1.5 * match.score + 0.5 * contrast
+    if moved.mean() <= SOMETHING_MOVED:
+        return 1.5 * match.score + 0.5 * contrast + 0.6 * motion
+    if motion < MOVED_SHARE:
+        return -np.inf
+    return 1.5 * match.score + 0.5 * contrast + 0.6 * motion + EXPLAINED_WEIGHT * arm.explained(silhouette)
 
 
 def _spread(judged: Sequence[tuple[float, _Match]], count: int) -> list[tuple[float, _Match]]:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
@@ -21,12 +22,12 @@ from .raster import render_depth
 from .region import ColourModel, TrackingMesh, colour_bins, edge_strength
 from .segment import Mask
 from .shape_fit import View, fit_shape, tracking_mesh
-from .spin import best_spins, object_evidence, spin_scores, spun
+from .spin import best_turns, object_evidence, turn_scores, turned
 from .tracker import Estimate, ObjectTracker
 from .vessels import Vessel
 from .video import Image
 
-GLIMPSES = 60  # frames kept for the spin
+GLIMPSES = 40  # frames kept for the spin
 FIT_VIEWS = 6  # frames that the shape is fitted to
 SECOND_LOOK_RAD = np.deg2rad(60)  # most that a second look at the spin may change: it mends, it does not turn round
 SURE = 0.5  # least confidence of a frame that the shape may be fitted to
@@ -34,10 +35,12 @@ SURE = 0.5  # least confidence of a frame that the shape may be fitted to
 
 @dataclass(frozen=True)
 class Glimpse:
-    """What is kept of a frame: half-size evidence of the object's colours and, for some, all a shape fit needs."""
+    """What is kept of a frame: at half size how object-coloured it is and where it has edges, (H, W) both; and, of
+    some frames, all that a shape fit needs."""
 
     index: int
     evidence: NDArray[np.float32]
+    near_edge: NDArray[np.float32]
     bins: NDArray[np.int32] | None
     edges: NDArray[np.float32] | None
     colours: ColourModel | None
@@ -88,13 +91,15 @@ class Followed:
         stride = max(1, frame_count // GLIMPSES)
         if self.guesses is None and self.vessel is not None and index % stride == 0:
             bins, colours = colour_bins(rgb), self.tracker.colours
+            edges = edge_strength(rgb)
             whole = len(self.glimpses) % max(1, GLIMPSES // (2 * FIT_VIEWS)) == 0
             self.glimpses.append(
                 Glimpse(
                     index,
                     object_evidence(bins, colours)[::2, ::2],
+                    _near_edge(edges),
                     bins if whole else None,
-                    edge_strength(rgb) if whole else None,
+                    edges if whole else None,
                     colours.copy() if whole else None,
                 )
             )
@@ -108,21 +113,23 @@ class Followed:
             return Followed(
                 mesh, None, self.camera_matrix, self.first_mask, self.tracker, guesses, first_look=self.estimates
             )
+        poses = _between_sure(poses, np.array([e.visible for e in self.estimates]))
         poses = self._with_settled_spin(poses, vessel)
-        vessel, shift = self._fitted(poses, vessel)
+        vessel, poses = self._fitted(poses, vessel)
         if vessel is not self.vessel:
             # A handle of the right size shows its side in frames where one of the wrong size did not.
-            mesh, poses = tracking_mesh(vessel), self._with_settled_spin(poses @ shift, vessel, SECOND_LOOK_RAD)
-        return Followed.start(mesh, vessel, self.camera_matrix, first_rgb, self.first_mask, poses[0], poses)
+            mesh, poses = tracking_mesh(vessel), self._with_settled_spin(poses, vessel, SECOND_LOOK_RAD)
+        return self._begun(mesh, vessel, first_rgb, poses, 0)
 
     def again(self, first_rgb: Image, index: int = 0) -> Followed:
         """The same before frame `index`, whose mask it has: what `second_pass` settled can be followed both ways."""
         if self.first_look is not None:
             return replace(self, estimates=[], glimpses=[])
         assert self.guesses is not None
-        return Followed.start(
-            self.mesh, self.vessel, self.camera_matrix, first_rgb, self.first_mask, self.guesses[index], self.guesses
-        )
+        return self._begun(self.mesh, self.vessel, first_rgb, self.guesses, index)
+
+    def _begun(self, mesh: TrackingMesh, vessel: Vessel | None, first_rgb: Image, poses: Array, index: int) -> Followed:
+        return Followed.start(mesh, vessel, self.camera_matrix, first_rgb, self.first_mask, poses[index], poses)
 
     @property
     def spin_source(self) -> str:
@@ -130,21 +137,23 @@ class Followed:
         return self.tracker.spin_source(len(self.estimates))
 
     def _with_settled_spin(self, poses: Array, vessel: Vessel, within_rad: float = np.pi) -> Array:
-        if vessel.symmetry.order == 0 or len(self.glimpses) < 2:
+        if vessel.symmetry.order == 0:
             return poses
         axis = vessel.interior.axis_xy_m
         camera = np.diag([0.5, 0.5, 1.0]) @ self.camera_matrix
-        light = tracking_mesh(vessel, 3000)
-        scores = [spin_scores(light, poses[g.index], camera, g.evidence, axis) for g in self.glimpses]
-        angles = best_spins(np.stack(scores), within_rad)
-        every = np.interp(np.arange(len(poses)), [g.index for g in self.glimpses], angles)
-        return np.stack([spun(T, angle, axis) for T, angle in zip(poses, every, strict=True)])
+        light = tracking_mesh(vessel, 1200)
+        glimpses = [g for g in self.glimpses if self.estimates[g.index].visible]
+        if len(glimpses) < 2:
+            return poses
+        at = np.array([g.index for g in glimpses])
+        scores = [turn_scores(light, poses[g.index], camera, g.evidence, g.near_edge, axis) for g in glimpses]
+        return turned(poses, at, best_turns(poses[at], np.stack(scores), within_rad), axis)
 
     def _fitted(self, poses: Array, vessel: Vessel) -> tuple[Vessel, Array]:
-        """The vessel fitted to several frames, and the pose of its frame in the old one's; unchanged if no better."""
+        """The vessel fitted to several frames, and its poses in all; unchanged if that is no better."""
         kept = [g for g in self.glimpses if g.bins is not None and self.estimates[g.index].confidence > SURE]
         if not kept:
-            return vessel, np.eye(4)
+            return vessel, poses
         chosen = [kept[k] for k in np.unique(np.linspace(0, len(kept) - 1, FIT_VIEWS).round().astype(int))]
         views = [
             View(g.bins, g.colours, poses[g.index], None, g.edges)
@@ -155,12 +164,13 @@ class Followed:
         before = self._merit(tracking_mesh(vessel), [v.T_camera_object for v in views], chosen)
         after = self._merit(tracking_mesh(fitted), fitted_poses, chosen)
         if after <= before:
-            return vessel, np.eye(4)
+            return vessel, poses
         shifts = np.stack([invert_pose(v.T_camera_object) @ T for v, T in zip(views, fitted_poses, strict=True)])
-        shift = np.eye(4)
-        shift[:3, :3] = Rotation.from_matrix(shifts[:, :3, :3]).mean().as_matrix()
-        shift[:3, 3] = np.median(shifts[:, :3, 3], axis=0)
-        return fitted, shift
+        # Single frames know how far off they stand, but all together know better how the vessel is turned.
+        turns = Rotation.from_matrix(shifts[:, :3, :3]).as_rotvec()
+        turns[:, 2] = np.median(turns[:, 2])
+        shifts[:, :3, :3] = Rotation.from_rotvec(turns).as_matrix()
+        return fitted, poses @ _between(shifts, np.array([g.index for g in chosen]), len(poses))
 
     def _merit(self, mesh: TrackingMesh, poses: list[Array], glimpses: list[Glimpse]) -> float:
         """Mean over the views of the share of object colours covered and of the outline on image edges."""
@@ -178,15 +188,29 @@ class Followed:
         return total / len(glimpses)
 
 
+def _near_edge(edges: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(H / 2, W / 2) strength of the strongest edge within a pixel or two, in [0, 1]."""
+    strength = np.minimum(np.linalg.norm(edges, axis=-1), 1.0)
+    return np.asarray(cv2.dilate(strength, np.ones((5, 5), np.uint8))[::2, ::2], np.float32)
+
+
 def _between_sure(poses: Array, sure: NDArray[np.bool_]) -> Array:
     """The poses (N, 4, 4), those that are not sure replaced by what lies between their sure neighbours."""
     at = np.flatnonzero(sure)
     if len(at) < 2:
         return poses
-    where = np.clip(np.arange(len(poses)), at[0], at[-1])
-    out = poses.copy()
-    out[:, :3, :3] = Slerp(at, Rotation.from_matrix(poses[at, :3, :3]))(where).as_matrix()
-    for axis in range(3):
-        out[:, axis, 3] = np.interp(where, at, poses[at, axis, 3])
+    out = _between(poses[at], at, len(poses))
     out[sure] = poses[sure]
+    return out
+
+
+def _between(poses: Array, at: NDArray[np.int_], count: int) -> Array:
+    """(count, 4, 4) poses of which those at some frames are known; before the first and after the last as there."""
+    if len(at) == 1:
+        return np.repeat(poses, count, axis=0)
+    where = np.clip(np.arange(count), at[0], at[-1])
+    out = np.tile(np.eye(4), (count, 1, 1))
+    out[:, :3, :3] = Slerp(at, Rotation.from_matrix(poses[:, :3, :3]))(where).as_matrix()
+    for axis in range(3):
+        out[:, axis, 3] = np.interp(where, at, poses[:, axis, 3])
     return out

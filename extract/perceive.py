@@ -14,6 +14,7 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 
+from .background import COVERED, SAMPLES, Background, learn_background
 from .both_ways import Clip, follow_both_ways, settle_rivals
 from .camera_motion import CameraWatch
 from .candidates import Model, vessel_model
@@ -30,11 +31,10 @@ from .progress import Progress
 from .rerun_log import load_rerun, write_rerun
 from .segment import check_box, mask_box
 from .smoothing import smooth_poses
-from .starting import STARTING_SIDE_PX, WORKING_SIDE_PX, NotFoundError, Start, resized, scaled, start_object
+from .starting import STARTING_SIDE_PX, WORKING_SIDE_PX, NotFoundError, Start, resized, scaled, sharpened, start_object
 from .track import ObjectTrack
-from .video import Image, VideoInfo, iterate_frames, read_video_info
+from .video import Image, VideoInfo, iterate_frames, read_video_info, sample_frames
 
-SMOOTHING_BANDWIDTH_S = 0.06
 TRUSTED_CONFIDENCE = 0.6  # mean over the clip, of an object that nobody pointed at
 SURE_OF_CAMERA = 0.5  # median share of the background that agrees on how the camera turned
 SEEN_SHARE = 0.1  # of the clip, least
@@ -44,12 +44,14 @@ OTHER_FRAMES = (15, 45, 120)  # looked at then
 
 @dataclass(frozen=True)
 class _Scene:
-    """The video with its camera at full, starting and working size."""
+    """The video with its camera at full, starting and working size; frames spread over it, and their background."""
 
     info: VideoInfo
     camera_matrix: Array
     start_scale: float
     scale: float
+    samples: Sequence[Image]
+    background: Background | None
 
     def camera(self, scale: float) -> Array:
         return np.asarray(np.diag([scale, scale, 1.0]) @ self.camera_matrix)
@@ -89,16 +91,18 @@ def extract(
     camera_matrix, camera_source = _camera_matrix(info, camera)
     longest = max(info.width_px, info.height_px)
     scales = (min(1.0, side / longest) for side in (STARTING_SIDE_PX, WORKING_SIDE_PX))
-    scene = _Scene(info, camera_matrix, *scales)
     for request in requests:
         if request.box_xywh_px is not None:
             check_box(request.box_xywh_px, info.width_px, info.height_px)
     models = [candidate_models(request) for request in requests]
 
     report(0, info.frame_count, "looking for " + " and ".join(request.name for request in requests))
+    samples = [frame.rgb for frame in sample_frames(info, SAMPLES, WORKING_SIDE_PX)]
+    background = None if camera_motion == "moving" else learn_background(samples)
+    scene = _Scene(info, camera_matrix, *scales, samples, background)
     index, sharp, starts = _find(scene, requests, models, start_frame)
     clip = Clip(info, index, _small(sharp, scene), scene.camera(scene.scale))
-    starts = settle_rivals(clip, starts)
+    starts = [sharpened(start, sharp, scene.camera(scene.start_scale)) for start in settle_rivals(clip, starts)]
     followed, watched = follow_both_ways(clip, starts, report, watch_camera=camera_motion != "static")
     time_s = np.array([watched.times[k] for k in sorted(watched.times)])
     R_first_camera, motion_words = _camera_turns(watched.camera, camera_motion)
@@ -110,12 +114,14 @@ def extract(
         confidence = np.array([e.confidence for e in result.estimates])
         raw = np.stack([e.T_camera_object for e in result.estimates])
         model = start.best.model if result.vessel is None else vessel_model(result.vessel)
-        smooth = smooth_poses(raw, time_s, confidence * visible, SMOOTHING_BANDWIDTH_S)
+        smooth = smooth_poses(raw, time_s, confidence * visible)
         header = _header(request, scene, start, model, index)
         header["camera"] = {"source": camera_source, "motion": motion_words}
         header["video"]["cuts"] = [{"frame": c.index, "time_s": round(c.time_s, 4)} for c in watched.cuts.cuts]
         header["settings"] |= {"spin_source": result.spin_source, "seed": seed}
-        tracks[request.name] = ObjectTrack(smooth, time_s, camera_matrix, confidence, visible, header, R_first_camera)
+        tracks[request.name] = ObjectTrack(
+            smooth, time_s, camera_matrix, confidence, visible, header, R_first_camera, raw
+        )
 
     out.mkdir(parents=True, exist_ok=True)
     items = [OverlayItem(track, f.mesh) for track, f in zip(tracks.values(), followed, strict=True)]
@@ -181,8 +187,12 @@ def _find_in(
     sharp: Image, scene: _Scene, requests: Sequence[ObjectRequest], models: Sequence[list[Model]]
 ) -> list[Start]:
     info, small = scene.info, _small(sharp, scene)
+    labels = None if scene.background is None else scene.background.labels(small)
+    # What moved at any time, or, better, what covers something that was seen at another time.
+    moved = motion_since(small, scene.samples)
+    if labels is not None:
+        moved = np.array(COVERED)[labels]
     starts: list[Start] = []
-    moved: Array | None = None
     for request, candidates in zip(requests, models, strict=True):
         mask = None
         if request.mask is not None:
@@ -192,10 +202,8 @@ def _find_in(
             given = check_box(request.box_xywh_px, info.width_px, info.height_px)
             box, source = scaled(given, scene.start_scale), "given"
         else:
-            if moved is None:
-                moved = motion_since(small, (f.rgb for f in iterate_frames(info.path, WORKING_SIDE_PX, info)))
             found_box = find_object(
-                small, moved, [m.mesh for m in candidates], scene.camera(scene.scale),
+                small, moved, [m.mesh for m in candidates], scene.camera(scene.scale), labels=labels,
                 handled=len(starts) == 0, taken=[resized(s.best.mask, small) for s in starts],
             )  # fmt: skip
             if found_box is None:
@@ -243,7 +251,6 @@ def _header(request: ObjectRequest, scene: _Scene, start: Start, model: Model, i
             "choice": chosen,
             "start_frame": index,
             "working_side_px": WORKING_SIDE_PX,
-            "smoothing_bandwidth_s": SMOOTHING_BANDWIDTH_S,
             "first_frame": start.described(),
         },
     }

@@ -30,6 +30,7 @@ from .region_kernels import (
 from .video import Image
 
 BITS = 4  # colour resolution per channel of the local histograms
+CHROMA_STEP = 5  # of Lab's a and b, in a bin
 BINS = 1 << (3 * BITS)
 LOCAL_CENTRES = 48
 CLEAR_EDGE = 24.0  # grey levels per px
@@ -174,7 +175,7 @@ def mask_evidence(mask: NDArray[np.bool_]) -> tuple[NDArray[np.int32], ColourMod
 def colour_bins(rgb: Image) -> NDArray[np.int32]:
     """(H, W) histogram bin of every pixel."""
     bins = np.empty(rgb.shape[:2], np.int32)
-    count_bins(rgb, BITS, bins)
+    count_bins(cv2.cvtColor(rgb, cv2.COLOR_RGB2LAB), BITS, CHROMA_STEP, bins)
     return bins
 
 

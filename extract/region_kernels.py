@@ -46,13 +46,18 @@ def free_lengths(
 
 
 @numba.njit(cache=True)
-def count_bins(rgb: NDArray[np.uint8], bits: int, bins: NDArray[np.int32]) -> None:
-    """Histogram bin of every pixel of (H, W, 3), `bits` a channel, into `bins` (H, W)."""
-    shift = 8 - bits
-    for y in range(rgb.shape[0]):
-        for x in range(rgb.shape[1]):
-            r, g, b = np.int32(rgb[y, x, 0]), np.int32(rgb[y, x, 1]), np.int32(rgb[y, x, 2])
-            bins[y, x] = ((r >> shift) << (2 * bits)) | ((g >> shift) << bits) | (b >> shift)
+def count_bins(lab: NDArray[np.uint8], bits: int, chroma_step: int, bins: NDArray[np.int32]) -> None:
+    """Histogram bin of every pixel of (H, W, 3) in 8-bit Lab, `bits` a channel, into `bins` (H, W).
+
+    Most things are nearly grey, so that hues are told apart finely near grey, a bin per `chroma_step`, and not at all
+    where they are vivid.
+    """
+    shift, side = 8 - bits, 1 << bits
+    for y in range(lab.shape[0]):
+        for x in range(lab.shape[1]):
+            a = min(max((np.int32(lab[y, x, 1]) - 128) // chroma_step + side // 2, 0), side - 1)
+            b = min(max((np.int32(lab[y, x, 2]) - 128) // chroma_step + side // 2, 0), side - 1)
+            bins[y, x] = ((np.int32(lab[y, x, 0]) >> shift) << (2 * bits)) | (a << bits) | b
 
 
 @numba.njit(cache=True)

@@ -10,6 +10,7 @@ from scipy.ndimage import gaussian_filter
 from .errors import UserError
 from .video import Image
 
+LAB_WEIGHTS = (0.7, 3.0, 3.0)
 CLOSING = 0.02  # of the box: gaps that highlights cut into shiny objects
 
 Mask = NDArray[np.bool_]
@@ -127,7 +128,10 @@ def _grabcut(rgb: Image, labels: NDArray[np.uint8], box: tuple[int, int, int, in
         return result
     cv2.setRNGSeed(0)  # GrabCut seeds its colour clusters from OpenCV's global generator
     models = np.zeros((1, 65)), np.zeros((1, 65))
-    image = np.ascontiguousarray(rgb[window][..., ::-1])
+    # Hues count more than brightness, which shading and shadows change.
+    lab = cv2.cvtColor(np.ascontiguousarray(rgb[window]), cv2.COLOR_RGB2LAB).astype(np.float32)
+    lab = np.clip((lab - [0, 128, 128]) * LAB_WEIGHTS + [0, 128, 128], 0, 255)
+    image = np.ascontiguousarray(lab, np.uint8)
     cv2.grabCut(image, part, (0, 0, 1, 1), *models, iterations, cv2.GC_INIT_WITH_MASK)
     result[window] = (part == cv2.GC_FGD) | (part == cv2.GC_PR_FGD)
     return result

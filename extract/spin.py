@@ -1,24 +1,31 @@
-"""How a vessel is turned about its own axis, found from the whole clip at once.
+"""How a vessel is turned about its own axis and leans in depth, found from the whole clip at once.
 
-A vessel's body hardly shows its spin; only handle, spout or lip do, and a hand often hides those. Frame by frame the
-spin is therefore a guess that drifts. Here every spin is scored in many frames by how well the silhouette covers
-what is object-coloured, and dynamic programming picks the spins that explain all frames while turning little between
-them (Viterbi, 1967).
+A vessel's body hardly shows its spin; only handle, spout or lip do, and a hand often hides those. And whether a body
+leans toward the camera or away from it changes its outline by perspective alone: the pose mirrored in depth looks
+nearly the same. Frame by frame both are a guess that drifts. Here every spin of the pose and of its mirror image is
+scored in many frames by how well its silhouette covers what is object-coloured and by the image edges along its
+outline and its inner contours, and dynamic programming picks the turns that explain all frames while changing little
+between them (Viterbi, 1967).
 """
 
 from __future__ import annotations
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
 
 from .geometry import Array
 from .raster import render_depth
 from .region import ColourModel, TrackingMesh
 
-SPINS = 48
+SPINS = 36
 EVIDENCE_RANGE = (-1.0, 2.0)  # log-odds; skin over a handle must not outvote the frames that show the handle
-TURN_COST = 0.03  # of a turn by one step between neighbouring samples, in mean log-odds over the object's area
+TURN_COST = 0.07  # of a change by one step between neighbouring samples, in mean log-odds over the object's area
+MOST_STEPS = 6  # a change by more costs no more: hands may be quick
+OUTER_WEIGHT, INNER_WEIGHT = 0.3, 0.15  # of edges along the outline and inside it, against the colours
+EXPECTED = 0.5  # edge along a right inner contour, least: less speaks against it
+JUMP = 0.08  # of the mesh's radius, in depth, that makes an inner contour
 
 
 def object_evidence(bins: NDArray[np.int32], colours: ColourModel) -> NDArray[np.float32]:
@@ -27,54 +34,116 @@ def object_evidence(bins: NDArray[np.int32], colours: ColourModel) -> NDArray[np
     return np.asarray(np.clip(odds, *EVIDENCE_RANGE)[bins], np.float32)
 
 
-def spin_scores(
+def turn_scores(
     mesh: TrackingMesh,
     T: Array,
     camera_matrix: Array,
     evidence: NDArray[np.float32],
+    edges: NDArray[np.float32] | None = None,
     axis_xy_m: tuple[float, float] = (0.0, 0.0),
 ) -> Array:
-    """(SPINS,) mean evidence under the silhouette, with the object turned about its upright axis in equal steps.
+    """(2, SPINS) how well every spin of a pose, and of its mirror image in depth, explains a picture.
 
-    All spins are divided by one area, so that covering more of the object's colours counts.
+    evidence: (H, W) from `object_evidence`.  edges: (H, W) strength of image edges near each pixel, in [0, 1].
+    All are divided by one area, so that covering more of the object's colours counts.
     """
-    height, width = evidence.shape
-    totals, areas = np.zeros(SPINS), np.zeros(SPINS)
-    for k in range(SPINS):
-        window = render_depth(mesh.vertices_m, mesh.faces, spun(T, 2 * np.pi * k / SPINS, axis_xy_m), camera_matrix)
-        if window is not None:
-            silhouette = window.mask_in_image(width, height)
-            totals[k], areas[k] = float(evidence[silhouette].sum()), float(np.count_nonzero(silhouette))
-    return totals / max(float(areas.mean()), 1.0)
+    strength = np.zeros((0, 0), np.float32) if edges is None else edges
+    sums = np.zeros((2, SPINS, 6))
+    for m, pose in enumerate((T, mirrored(T))):
+        for k in range(SPINS):
+            at = spun(pose, 2 * np.pi * k / SPINS, axis_xy_m)
+            window = render_depth(mesh.vertices_m, mesh.faces, at, camera_matrix)
+            if window is not None:
+                jump_m = JUMP * mesh.radius_m
+                _sum_up(window.depth_m, window.x0_px, window.y0_px, evidence, strength, jump_m, sums[m, k])
+    covered, area, outer, rim, inner, contour = np.moveaxis(sums, -1, 0)
+    rim = np.maximum(rim, 1.0)
+    edge = OUTER_WEIGHT * outer / rim + INNER_WEIGHT * (inner - EXPECTED * contour) / rim
+    return np.asarray(covered / max(float(area.mean()), 1.0) + (0.0 if edges is None else edge))
 
 
-def best_spins(scores: Array, within_rad: float = np.pi) -> Array:
-    """(M,) spins in rad, continuous over the M samples, that maximise the summed scores (M, SPINS) less the turning.
+def best_turns(T: Array, scores: Array, within_rad: float = np.pi) -> Array:
+    """(M, 3, 3) turns to apply to M poses, in each one's object frame, that maximise the scores less the changing.
 
-    within_rad: no spin is farther than this from none.
+    T: (M, 4, 4).  scores: (M, 2, SPINS) from `turn_scores`.
+    within_rad: no spin is farther than this from none, and nothing is mirrored when it is less than half a turn.
     """
     angle_rad = 2 * np.pi * np.minimum(np.arange(SPINS), SPINS - np.arange(SPINS)) / SPINS
     scores = np.where(angle_rad <= within_rad + 1e-9, scores, -np.inf)
-    step = np.abs((np.arange(SPINS)[:, None] - np.arange(SPINS)[None] + SPINS // 2) % SPINS - SPINS // 2)
-    cost = TURN_COST * np.minimum(step, 6) ** 2
+    spins = Rotation.from_rotvec([[0.0, 0.0, 2 * np.pi * k / SPINS] for k in range(SPINS)]).as_matrix()
+    plain = np.broadcast_to(spins, (len(T), SPINS, 3, 3))
+    flips = np.stack([pose[:3, :3].T @ mirrored(pose)[:3, :3] for pose in T])
+    turns = np.concatenate([plain, np.einsum("mij,kjl->mkil", flips, spins)], axis=1)
+    if within_rad < np.pi:
+        turns, scores = turns[:, :SPINS], scores[:, :1]
+    scores = scores.reshape(len(T), -1)
     total, back = scores[0].copy(), np.zeros(scores.shape, int)
     for m in range(1, len(scores)):
-        options = total[None, :] - cost
+        cosine = (np.einsum("iab,jab->ij", turns[m], turns[m - 1]) - 1) / 2
+        steps = np.arccos(np.clip(cosine, -1, 1)) * SPINS / (2 * np.pi)
+        options = total[None, :] - TURN_COST * np.minimum(steps, MOST_STEPS) ** 2
         back[m] = np.argmax(options, axis=1)
         total = scores[m] + np.max(options, axis=1)
     path = [int(np.argmax(total))]
     for m in range(len(scores) - 1, 0, -1):
         path.append(int(back[m][path[-1]]))
-    return np.asarray(np.unwrap(2 * np.pi * np.array(path[::-1]) / SPINS))
+    return np.asarray(turns[np.arange(len(T)), path[::-1]])
+
+
+def turned(T: Array, at: NDArray[np.int_], turns: Array, axis_xy_m: tuple[float, float] = (0.0, 0.0)) -> Array:
+    """The poses (N, 4, 4) with turns (M, 3, 3), known at frames `at` (M,), applied where they are and in between."""
+    frames = np.clip(np.arange(len(T)), at[0], at[-1])
+    every = Rotation.from_matrix(turns)[np.zeros(len(T), int)] if len(at) < 2 else Slerp(
+        at, Rotation.from_matrix(turns)
+    )(frames)  # fmt: skip
+    out = T.copy()
+    out[:, :3, :3] = T[:, :3, :3] @ every.as_matrix()
+    # The body stays where it is: a vessel's body stands on its axis, not on the centre of its bounding box, which
+    # handle and spout shift.
+    out[:, :3, 3] += (T[:, :3, :3] - out[:, :3, :3]) @ np.array([*axis_xy_m, 0.0])
+    return out
+
+
+def mirrored(T: Array) -> Array:
+    """The pose that looks the same but for perspective: mirrored in depth, of an object that is its own mirror in y."""
+    ray = T[:3, 3] / np.linalg.norm(T[:3, 3])
+    out = T.copy()
+    out[:3, :3] = (np.eye(3) - 2 * np.outer(ray, ray)) @ T[:3, :3] @ np.diag([1.0, -1.0, 1.0])
+    return out
 
 
 def spun(T: Array, angle_rad: float, axis_xy_m: tuple[float, float] = (0.0, 0.0)) -> Array:
-    """The pose with the object turned about the line through `axis_xy_m` along its own +z.
+    """The pose with the object turned about the line through `axis_xy_m` along its own +z."""
+    turn = Rotation.from_rotvec([0.0, 0.0, angle_rad]).as_matrix()
+    return np.asarray(turned(T[None], np.zeros(1, int), turn[None], axis_xy_m)[0])
 
-    A vessel's body stands on this line, not on the centre of its bounding box, which handle and spout shift.
-    """
-    turned = T.copy()
-    turned[:3, :3] = T[:3, :3] @ Rotation.from_rotvec([0.0, 0.0, angle_rad]).as_matrix()
-    foot = np.array([*axis_xy_m, 0.0])
-    turned[:3, 3] += (T[:3, :3] - turned[:3, :3]) @ foot
-    return turned
+
+@numba.njit(cache=True)
+def _sum_up(
+    depth: NDArray[np.float32], x0: int, y0: int, evidence: NDArray[np.float32], edges: NDArray[np.float32],
+    jump_m: float, sums: Array,
+) -> None:  # fmt: skip
+    """Into sums (6,): evidence and area of a silhouette, edge and length of its outline, and of the jumps inside it."""
+    h, w = depth.shape
+    with_edges = edges.shape[0] > 0
+    for y in range(1, h - 1):
+        for x in range(1, w - 1):
+            d = depth[y, x]
+            v, u = y + y0, x + x0
+            if d == 0.0 or v < 0 or u < 0 or v >= evidence.shape[0] or u >= evidence.shape[1]:
+                continue
+            sums[0] += evidence[v, u]
+            sums[1] += 1.0
+            if not with_edges:
+                continue
+            outside, behind = False, False
+            for side in range(4):
+                other = depth[y + (side == 0) - (side == 1), x + (side == 2) - (side == 3)]
+                outside |= other == 0.0
+                behind |= other > d + jump_m
+            if outside:
+                sums[2] += edges[v, u]
+                sums[3] += 1.0
+            elif behind:
+                sums[4] += edges[v, u]
+                sums[5] += 1.0

@@ -7,7 +7,7 @@ to the picture. What explains the picture nearly as well but is turned otherwise
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -42,23 +42,28 @@ class NotFoundError(UserError):
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """One explanation of the start frame: mesh, pose, and the object's mask at the starting resolution."""
+    """One explanation of the start frame, at the starting resolution.
+
+    mask, box: of the object as it is explained.  evidence: the mask that it was fitted to.
+    """
 
     model: Model
     pose: PoseCandidate
     mask: Mask
     box: Box
+    evidence: Mask
 
 
 @dataclass(frozen=True)
 class Start:
     """An object in the start frame, at the starting resolution: its explanations, best first.
 
-    box_source: "given", "mask" or "found".
+    box_source: "given", "mask" or "found".  box: where it was looked for.
     """
 
     hypotheses: tuple[Hypothesis, ...]
     box_source: str
+    box: Box
 
     @property
     def best(self) -> Hypothesis:
@@ -86,7 +91,7 @@ class Start:
     def preferring(self, index: int) -> Start:
         """The same with another hypothesis put first."""
         chosen = self.hypotheses[index]
-        return Start((chosen, *(h for h in self.hypotheses if h is not chosen)), self.box_source)
+        return replace(self, hypotheses=(chosen, *(h for h in self.hypotheses if h is not chosen)))
 
 
 def start_object(
@@ -98,7 +103,7 @@ def start_object(
     camera_matrix: Array,
     mask: Mask | None = None,
 ) -> Start:
-    """Choose among the candidate meshes, then fit pose and shape to the start frame.
+    """What the object may be and how it may stand in the start frame, fitted coarsely, best first.
 
     rgb, box, camera_matrix and mask (cut from the box when None) are at the starting resolution.
     Raises NotFoundError when no pose of any candidate explains what is there.
@@ -110,11 +115,11 @@ def start_object(
     shrink = min(1.0, WORKING_SIDE_PX / max(rgb.shape[:2]))
     small = np.asarray(cv2.resize(rgb, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA), np.uint8)
     small_box, small_camera = scaled(box, shrink), np.diag([shrink, shrink, 1.0]) @ camera_matrix
-    small_mask = mask_from_box(small, small_box) if mask is None else resized(mask, small)
+    cut = mask_from_box(small, small_box) if mask is None else resized(mask, small)
     ranked: list[tuple[PoseCandidate, Model]] = []
     for model in candidates:
         poses = find_first_pose(
-            model.mesh, small, small_mask, small_camera, box_xywh_px=small_box,
+            model.mesh, small, cut, small_camera, box_xywh_px=small_box,
             symmetry=model.symmetry, stands=model.vessel is not None,
         )  # fmt: skip
         ranked += [(pose, model) for pose in distinct(poses, APART_DEG, HYPOTHESES, HYPOTHESES_WITHIN, model.symmetry)]
@@ -125,21 +130,24 @@ def start_object(
             "was cut out of the frame"
         )
     fits = [
-        _fitted(model, pose, small, small_mask, small_box, source, small_camera, 1, COARSE_STEPS_PX)
+        _fitted(model, pose, small, cut, small_box, source, small_camera, 1, COARSE_STEPS_PX)
         for pose, model in ranked[:HYPOTHESES]
     ]
     fits.sort(key=lambda fit: fit[1].merit, reverse=True)
     kept = distinct([pose for _, pose, _ in fits], APART_DEG, HYPOTHESES, RIVAL_WITHIN, fits[0][0].symmetry)
-    found: list[Hypothesis] = []
-    for model, pose, evidence in fits:
-        if any(pose is k for k in kept):
-            sharp = resized(evidence, rgb) if mask is None else mask
-            # Rivals are only tried for a while: the fine fit is for the best.
-            rounds = 0 if found else FIT_ROUNDS
-            found.append(
-                _hypothesis(*_fitted(model, pose, rgb, sharp, box, source, camera_matrix, rounds), rgb, camera_matrix)
-            )
-    return Start(tuple(found), source)
+    found = [
+        _hypothesis(model, pose, resized(evidence, rgb) if mask is None else mask, rgb, camera_matrix)
+        for model, pose, evidence in fits
+        if any(pose is k for k in kept)
+    ]
+    return Start(tuple(found), source, box)
+
+
+def sharpened(start: Start, rgb: Image, camera_matrix: Array) -> Start:
+    """The start with its best hypothesis fitted to the frame at full sharpness, as it was given to `start_object`."""
+    best, *others = start.hypotheses
+    fit = _fitted(best.model, best.pose, rgb, best.evidence, start.box, start.box_source, camera_matrix, FIT_ROUNDS)
+    return replace(start, hypotheses=(_hypothesis(*fit, rgb, camera_matrix), *others))
 
 
 def _hypothesis(model: Model, pose: PoseCandidate, evidence: Mask, rgb: Image, camera_matrix: Array) -> Hypothesis:
@@ -148,7 +156,7 @@ def _hypothesis(model: Model, pose: PoseCandidate, evidence: Mask, rgb: Image, c
     mask = evidence & silhouette
     if model.vessel is not None:
         model = vessel_model(coloured(model.vessel, rgb, mask))
-    return Hypothesis(model, pose, mask if mask.any() else silhouette, mask_box(silhouette))
+    return Hypothesis(model, pose, mask if mask.any() else silhouette, mask_box(silhouette), evidence)
 
 
 def _fitted(

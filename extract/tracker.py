@@ -35,6 +35,8 @@ TRUSTED = 0.5  # texture that may start a frame's refinement and tell the spin o
 SURE_MATCHES = 20
 STILL_SPIN_RAD, HELD_SPIN_RAD = 1e-3, 0.014  # what cannot be seen; what the whole clip has told
 TEXTURED_SHARE = 0.3
+GUESS_MARGIN = 0.05  # of confidence, by which going on must be better than a guess
+APART_RAD, APART_SHARE = 0.07, 0.07  # of the mesh's radius
 LOOK_AROUND = 0.3  # of the object's size, and LOOK_AROUND_PX
 LOOK_AROUND_PX = 50
 SEARCH_EVERY = 3  # frames, for what has been lost for long
@@ -135,11 +137,18 @@ class ObjectTracker:
         self.texture.keep(part.picture, part.camera_matrix, T_camera_object)
 
     def step(self, rgb: Image, guess: Array | None = None) -> Estimate:
-        """Pose in the next frame, refined from `guess` or else from where the motion so far leads."""
-        start = self._predicted() if guess is None else guess
+        """Pose in the next frame, refined from where the motion so far leads or from `guess`, which is preferred."""
+        ahead = self._predicted()
+        start = ahead if guess is None else guess
         part = self._around(rgb, start)
         best = self._fitted(part, start, spin=0.02 if guess is None else HELD_SPIN_RAD)
-        if best.confidence < LOST_BELOW and guess is None:
+        if guess is not None and self._lost_frames == 0 and self._differ(ahead, guess):
+            # A guess from a first look that went astray is given up for where the second look has come.
+            other_part = self._around(rgb, ahead)
+            other = self._fitted(other_part, ahead, spin=HELD_SPIN_RAD)
+            if other.confidence > best.confidence + GUESS_MARGIN:
+                part, best = other_part, other
+        if best.confidence < LOST_BELOW:
             part = self._part(rgb, 0, 0, rgb.shape[1], rgb.shape[0])
             best = self._searched(part, best, start)
         self.signs = best.signs
@@ -150,6 +159,12 @@ class ObjectTracker:
             return Estimate(start, best.confidence, False)
         self._accept(best, part)
         return Estimate(best.T_camera_object, best.confidence, True)
+
+    def _differ(self, one: Array, other: Array) -> bool:
+        """Whether two poses are so far apart that refinement from them may end in different places."""
+        turn = Rotation.from_matrix(one[:3, :3].T @ other[:3, :3]).magnitude()
+        shift = np.linalg.norm(one[:3, 3] - other[:3, 3])
+        return bool(turn > APART_RAD or shift > APART_SHARE * self.mesh.radius_m)
 
     def _accept(self, fit: _Fit, part: _Part) -> None:
         """Go on from a fit, and learn from it what it is sure enough to teach."""

@@ -30,6 +30,7 @@ Image = NDArray[np.uint8]
 # A few broken packets are common at the start of clips cut from a longer recording; more means a damaged file.
 MAX_BROKEN_FRACTION = 0.02
 REORDER_DEPTH = 8
+SEEK_ABOVE = 60  # frames from one to the next that is wanted, above which the video is entered at each
 PIECE_FRAMES = 64  # held in memory at once when a clip is read backward
 _SAME_S = 1e-7
 _CLOCK_HZ = 90_000
@@ -152,6 +153,22 @@ def iterate_backward(path: Path, time_s: Sequence[float], max_side_px: int | Non
             raise UserError(f"video {path} changed while it was read, or cannot be decoded twice the same; copy it")
         for k in range(end - 1, begin - 1, -1):
             yield Frame(k, time_s[k], piece.pop(k - begin))
+
+
+def sample_frames(info: VideoInfo, count: int, max_side_px: int | None = None) -> list[Frame]:
+    """At most `count` frames spread evenly over a video, in order."""
+    wanted = np.unique(np.linspace(0, info.frame_count - 1, count).round().astype(int))
+    if info.frame_count <= SEEK_ABOVE * count:
+        return [frame for frame in iterate_frames(info.path, max_side_px, info) if frame.index in wanted]
+    # Reading a long video to its end takes minutes; entering it at a few places does not.
+    origin = next(_decode(info.path), None)
+    start_s = 0.0 if origin is None else float(origin.time or 0.0)
+    frames = []
+    for k in wanted:
+        time_s = float(info.time_s[k])
+        for rgb in _pick(_decode(info.path, start_s + time_s), [start_s + time_s], max_side_px).values():
+            frames.append(Frame(int(k), time_s, rgb))
+    return frames
 
 
 class VideoWriter:

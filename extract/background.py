@@ -1,0 +1,208 @@
+"""What a still camera sees behind everything that moves, learned from frames spread over the clip.
+
+Where the background is known, a pixel that looks like it shows no object, and one that looks like it but darker shows
+a shadow. This is what tells an object from its shadow, and its thin parts from the clutter behind them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from .geometry import Array
+from .video import Image
+
+SAMPLES = 24
+BLUR_PX = 1.0
+SAME_LEVELS = 12.0  # grey levels, of a channel, by which what is the same may differ: noise, compression
+SHADOW_LEVELS = 9.0  # by which a shadow may differ from the background made darker
+DARKEST = 0.4  # brightness of a shadow, of the background's
+FOREGROUND, BACKGROUND, SHADOW = 0, 1, 2
+COVERED = (1.0, 0.0, 0.7)  # how likely something is there, by label: grey things pass for shadows
+ALWAYS, MOSTLY, SOMETIMES, SELDOM = 0.9, 0.5, 0.1, 0.05  # shares of the frames
+NEAR_PX, FADING_PX = 60.0, 8.0  # surroundings that count, the nearer the more
+STEP_LEVELS, FEWEST_PX = 24, 8  # between neighbouring pixels of two things; to decide a part by
+TEXTURE_LEVELS, STILL_TEXTURE = 30.0, 0.35  # a camera is still when so much of what has edges stays where it is
+GAIN_STRIDE, GAIN_LIMITS = 8, (0.6, 1.6)  # pixels looked at for a change of light, and how much of it is believed
+
+
+@dataclass(frozen=True)
+class Background:
+    """rgb: (H, W, 3) the scene without what moves in it.  known: (H, W) where that could be seen."""
+
+    rgb: Image
+    known: NDArray[np.bool_]
+
+    def labels(self, rgb: Image) -> NDArray[np.uint8]:
+        """(H, W) what every pixel of a frame shows: FOREGROUND, BACKGROUND, or SHADOW: the same but darker.
+
+        FOREGROUND also stands for what cannot be told. A change of the light as a whole is allowed for.
+        """
+        out = np.empty(rgb.shape[:2], np.uint8)
+        gain = _gain(rgb, self.rgb, self.known)
+        _label(_soft(rgb), self.rgb, self.known, gain, DARKEST, SAME_LEVELS, SHADOW_LEVELS, out)
+        return out
+
+
+def learn_background(frames: Sequence[Image]) -> Background | None:
+    """The background of a clip, from some of its frames (H, W, 3) in order; None when the camera does not stand still.
+
+    A pixel that shows one colour nearly always shows the background. One that shows two for long was left or taken by
+    something: which of the two is background is told by what lies around the place, where nothing changed.
+    """
+    if len(frames) < 4:
+        return None
+    first = _soft(frames[0])
+    everywhere = np.ones(first.shape[:2], bool)
+    stack = [first]
+    for rgb in frames[1:]:
+        soft = _soft(rgb)
+        stack.append(np.asarray(np.clip(soft / _gain(soft, first, everywhere), 0, 255), np.uint8))
+    modes, share, when = _two_modes(np.stack(stack), SAME_LEVELS)
+    edges = cv2.Sobel(modes[0], cv2.CV_32F, 1, 0) ** 2 + cv2.Sobel(modes[0], cv2.CV_32F, 0, 1) ** 2
+    textured = edges.max(axis=-1) > TEXTURE_LEVELS**2
+    if not textured.any() or np.mean(share[0][textured] > MOSTLY) < STILL_TEXTURE:
+        return None
+    settled = (share[0] > ALWAYS) | ((share[0] > MOSTLY) & (share[1] < SELDOM))
+    second = _second_is_background(modes, settled, when)
+    rgb = np.where(second[..., None], modes[1], modes[0])
+    known = settled | (np.where(second, share[1], share[0]) > SOMETIMES)
+    return Background(np.ascontiguousarray(rgb), known)
+
+
+def _second_is_background(modes: Image, settled: NDArray[np.bool_], when: Array) -> NDArray[np.bool_]:
+    """(H, W) where the second of the two modes (2, H, W, 3) goes on into the settled surroundings, not the first.
+
+    Places that were left and places that were taken are told apart by the order of their modes, `when` (2, H, W).
+    """
+    out = np.zeros(settled.shape, bool)
+    if not settled.any() or settled.all():
+        return out
+    distance, nearest = cv2.distanceTransformWithLabels(
+        (~settled).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    place = np.zeros(int(nearest.max()) + 1, int)
+    place[nearest[settled]] = np.flatnonzero(settled)
+    around = modes[0].reshape(-1, 3)[place[nearest]]
+    misfit = [np.abs(mode.astype(np.int16) - around).max(axis=-1) for mode in modes]
+    rim = ~settled & (distance <= NEAR_PX)
+    nearness = np.exp(-distance / FADING_PX)
+    # A thing and its shadow are decided each for itself: parts end where either mode's colour changes.
+    even = ~settled
+    for mode in modes:
+        steps = cv2.morphologyEx(mode, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)).max(axis=-1)
+        even &= steps < STEP_LEVELS
+    for order in (when[0] <= when[1], when[0] > when[1]):
+        here = ~settled & order
+        count, part = cv2.connectedComponents((even & order).astype(np.uint8))
+        decided = np.bincount(part[rim], minlength=count) >= FEWEST_PX
+        decided[0] = False
+        if not decided.any():
+            continue
+        weight = [np.bincount(part[rim], (m * nearness)[rim], count) for m in misfit]
+        second = weight[1] < weight[0]
+        # What touches nothing settled goes with the nearest part that does.
+        sure = decided[part]
+        _, near = cv2.distanceTransformWithLabels(
+            (~sure).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+        )
+        verdict = np.zeros(int(near.max()) + 1, bool)
+        verdict[near[sure]] = second[part[sure]]
+        out |= verdict[near] & here
+    return out
+
+
+def _soft(rgb: Image) -> Image:
+    return np.asarray(cv2.GaussianBlur(rgb, (0, 0), BLUR_PX), np.uint8)
+
+
+def _gain(rgb: Image, reference: Image, known: NDArray[np.bool_]) -> Array:
+    """(3,) by how much brighter each channel of a picture is than the same place of another, most places agreeing."""
+    step = np.s_[::GAIN_STRIDE, ::GAIN_STRIDE]
+    a, b = rgb[step][known[step]].astype(float), reference[step][known[step]].astype(float)
+    usable = ((a > 16) & (a < 245) & (b > 16) & (b < 245)).all(axis=1)
+    if np.count_nonzero(usable) < 50:
+        return np.ones(3)
+    return np.asarray(np.clip(np.median(a[usable] / b[usable], axis=0), *GAIN_LIMITS))
+
+
+@numba.njit(cache=True)
+def _two_modes(
+    stack: NDArray[np.uint8], same: float
+) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.float32]]:
+    """The two colours that each pixel of (K, H, W, 3) shows most often: (2, H, W, 3), shares and mean k (2, H, W)."""
+    count, h, w, _ = stack.shape
+    modes = np.zeros((2, h, w, 3), np.uint8)
+    share, when = np.zeros((2, h, w), np.float32), np.zeros((2, h, w), np.float32)
+    taken = np.zeros(count, np.bool_)
+    for y in range(h):
+        for x in range(w):
+            taken[:] = False
+            for m in range(2):
+                best, best_k = 0, -1
+                for k in range(count):
+                    if taken[k]:
+                        continue
+                    agree = 0
+                    for j in range(count):
+                        if not taken[j]:
+                            d = 0.0
+                            for c in range(3):
+                                d = max(d, abs(float(stack[k, y, x, c]) - float(stack[j, y, x, c])))
+                            agree += d < same
+                    if agree > best:
+                        best, best_k = agree, k
+                if best_k < 0:
+                    break
+                total, at, n = np.zeros(3), 0.0, 0
+                for j in range(count):
+                    if not taken[j]:
+                        d = 0.0
+                        for c in range(3):
+                            d = max(d, abs(float(stack[best_k, y, x, c]) - float(stack[j, y, x, c])))
+                        if d < same:
+                            n += 1
+                            at += j
+                            for c in range(3):
+                                total[c] += stack[j, y, x, c]
+                            if j != best_k:
+                                taken[j] = True
+                taken[best_k] = True
+                for c in range(3):
+                    modes[m, y, x, c] = np.uint8(total[c] / n + 0.5)
+                share[m, y, x], when[m, y, x] = n / count, at / n
+    return modes, share, when
+
+
+@numba.njit(cache=True)
+def _label(
+    rgb: NDArray[np.uint8], background: NDArray[np.uint8], known: NDArray[np.bool_], gain: Array, darkest: float,
+    same: float, shadow_same: float, out: NDArray[np.uint8],
+) -> None:  # fmt: skip
+    for y in range(rgb.shape[0]):
+        for x in range(rgb.shape[1]):
+            out[y, x] = FOREGROUND
+            if not known[y, x]:
+                continue
+            off, seen, expected = 0.0, 0.0, 0.0
+            for c in range(3):
+                b = gain[c] * background[y, x, c]
+                off = max(off, abs(rgb[y, x, c] - b))
+                seen += rgb[y, x, c]
+                expected += b
+            if off < same:
+                out[y, x] = BACKGROUND
+                continue
+            ratio = seen / max(expected, 1.0)
+            if ratio >= 1.0 or ratio < darkest:
+                continue
+            off = 0.0
+            for c in range(3):
+                off = max(off, abs(rgb[y, x, c] - ratio * gain[c] * background[y, x, c]))
+            if off < shadow_same:
+                out[y, x] = SHADOW
