@@ -33,6 +33,7 @@ class BenchPose(Command):
     masks: Annotated[Literal["true", "proposed"], arg(help="The data set's visible masks, or what is found.")] = "true"
     meshes: Annotated[Literal["retrieved", "true"], arg(help="Of the database, or each object's own.")] = "retrieved"
     sizes: Annotated[Literal["own", "true", "constant"], arg(help="Found, each object's own, or 10 cm.")] = "own"
+    size_table: Annotated[Path | None, told("FILE", "Usual sizes, csv or json. Default: the one that ships.")] = None
     descriptor: Annotated[
         Literal["average", "summary"] | None, told(None, "For retrieval: FFA or CLS. Default: the encoder's usual one.")
     ] = None

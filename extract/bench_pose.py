@@ -19,6 +19,7 @@ from .image_pose import ImagePoser
 from .mesh_store import MeshStore
 from .progress import Progress
 from .proposal_metrics import ProposedMask, write_proposals
+from .size_table import load_size_table
 
 
 def bench_pose(
@@ -35,6 +36,7 @@ def bench_pose(
     views: int | None = None,
     level: Level = "auto",
     models_dir: Path | None = None,
+    size_table: Path | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Find the objects of a data set by a mesh database; see the options of `vid2demo bench pose`.
@@ -46,9 +48,10 @@ def bench_pose(
     kind: dict[str, Any] = {"level": level, "models_dir": models_dir}
     depth = choose("depth", lambda: None, **kind).made
     proposed = masks == "proposed"
+    table = None if size_table is None else load_size_table(size_table)
     found = pose_dataset(
         opened,
-        ImagePoser(store, features_of(store.encoder, options), column=descriptor, depth=depth),
+        ImagePoser(store, features_of(store.encoder, options), column=descriptor, depth=depth, table=table),
         out / "poses.csv",
         segmenter=choose("segmenter", ClassicalSegmenter, **kind).made if proposed else None,
         meshes=meshes,

@@ -37,12 +37,20 @@ class Table:
     rows: tuple[Row, ...]
 
 
-def _ours(options: str = "") -> str:
-    return f"vid2demo pose DATASET --out FILE.csv{options and ' ' + options}"
+def _ours(bench: str = "", onboard: str = "", meshes: str = "MESHES", network: str = "") -> str:
+    """Our own commands: meshes taken into a database, then the data set's objects found by it."""
+    pull = f"vid2demo models pull {network}; " if network else ""
+    features = f" --features {network}" if network else ""
+    return (
+        f"{pull}vid2demo meshes onboard {meshes}{features}{onboard} --out DB; "
+        f"vid2demo bench pose DATASET --db DB --out OUT{bench}"
+    )
 
 
 _BASELINE = "run {name} with our retrieved meshes and sizes, and give its BOP csv"
-_WEIGHTS = "the paper's networks: vid2demo models pull, then "
+_TRUE = {"bench": " --meshes true --sizes true", "onboard": " --unit mm", "meshes": "DATASET/models"}
+_PAPER = "dinov2-large"
+_DESCRIPTORS = {"cls": "summary", "ffa": "average"}
 
 
 def _baseline(key: str, title: str, *figures: Sequence[float]) -> Row:
@@ -86,15 +94,16 @@ TABLES: dict[str, Table] = {
             Row(
                 "ours",
                 "Ours (the paper's networks)",
-                _WEIGHTS + _ours("--features dinov2"),
+                _ours(" --masks proposed", network=_PAPER),
                 {
                     YCBV: (49.86, 45.20, 18.53, 85.83),
                     HOPE: (45.98, 39.21, 10.72, 88.01),
                     DTTD2: (47.11, 52.10, 12.68, 76.54),
                 },
             ),
-            Row("classical", "Ours, classical features", _ours()),
-            Row("classical-oracle", "Ours, classical features, true meshes", _ours("--oracle mesh")),
+            Row("classical", "Ours, classical features, true masks", _ours()),
+            Row("classical-oracle", "Ours, classical features, true masks, meshes and sizes", _ours(**_TRUE)),
+            Row("classical-proposed", "Ours, classical features and segmenter", _ours(" --masks proposed")),
         ),
     ),
     "retrieval": Table(
@@ -112,7 +121,7 @@ TABLES: dict[str, Table] = {
                 Row(
                     f"{kind}-{layer}",
                     f"Ours (layer {layer}, {kind.upper()})",
-                    _WEIGHTS + _ours(f"--features dinov2 --layer {layer} --descriptor {kind}"),
+                    _ours(" --descriptor " + _DESCRIPTORS[kind], f" --block {layer}", network=_PAPER),
                     {YCBV: figures},
                 )
                 for kind, layers in {
@@ -134,19 +143,19 @@ TABLES: dict[str, Table] = {
             Row(
                 "oracle-cls",
                 "Oracle, CLS",
-                _WEIGHTS + _ours("--features dinov2 --oracle mesh"),
+                _ours(**_TRUE, network=_PAPER),
                 {YCBV: (63.31, 52.42, 46.43, 91.07)},
             ),
             Row(
                 "oracle-ffa",
                 "Oracle, FFA",
-                _WEIGHTS + _ours("--features dinov2 --oracle mesh"),
+                _ours(**_TRUE, network=_PAPER),
                 {YCBV: (62.93, 51.99, 45.95, 90.85)},
             ),
-            Row("classical-cls", "Classical, one descriptor of the crop", _ours("--descriptor cls")),
-            Row("classical-ffa", "Classical, averaged over the foreground", _ours("--descriptor ffa")),
-            Row("classical-oracle", "Classical, true meshes", _ours("--oracle mesh")),
-            Row("moments", "Silhouette moments alone", _ours("--descriptor moments")),
+            Row("classical-cls", "Classical, one descriptor of the crop", _ours(" --descriptor summary")),
+            Row("classical-ffa", "Classical, averaged over the foreground", _ours(" --descriptor average")),
+            Row("classical-oracle", "Classical, true meshes and sizes", _ours(**_TRUE)),
+            Row("moments", "Silhouette moments alone", "python bench/retrieval_baselines.py DATASET"),
             Row("chance", "Chance", ""),
         ),
     ),
@@ -155,7 +164,7 @@ TABLES: dict[str, Table] = {
         "paper table 8",
         {**AR_COLUMNS, "spacing_deg": "Avg err [deg]", "seconds_per_image": "s/image"},
         tuple(
-            Row(f"views-{count}", f"{count} views", _ours(f"--views {count}"), {YCBV: figures})
+            Row(f"views-{count}", f"{count} views", _ours(f" --views {count}", f" --views {count}"), {YCBV: figures})
             for count, figures in (
                 (600, (49.86, 45.20, 18.53, 85.83, 25.0)),
                 (1200, (49.66, 44.64, 19.10, 85.24, 20.0)),
@@ -168,13 +177,13 @@ TABLES: dict[str, Table] = {
         "paper tables 3 and 9",
         {"ar_ch": "AR_CH", "scale_error_percent": "scale error [%]"},
         (
-            Row("constant", "Constant, 10 cm", _ours("--scale constant"), {YCBV: (11.89,)}),
+            Row("constant", "Constant, 10 cm", _ours(" --sizes constant"), {YCBV: (11.89,)}),
             Row("ours", "Ours (size table of this package)", _ours()),
-            Row("gpt-4", "Ours, GPT-4's table", _ours("--sizes TABLE.csv"), {YCBV: (18.53,)}),
-            Row("gpt-3.5", "Ours, GPT-3.5-Turbo's table", _ours("--sizes TABLE.csv"), {YCBV: (4.85,)}),
-            Row("llama-3.1", "Ours, Llama-3.1-8B's table", _ours("--sizes TABLE.csv"), {YCBV: (16.92,)}),
-            Row("gemma-2", "Ours, Gemma2-9B's table", _ours("--sizes TABLE.csv"), {YCBV: (6.98,)}),
-            Row("oracle", "Oracle", _ours("--oracle scale"), {YCBV: (45.95,)}),
+            Row("gpt-4", "Ours, GPT-4's table", _ours(" --size-table TABLE.json"), {YCBV: (18.53,)}),
+            Row("gpt-3.5", "Ours, GPT-3.5-Turbo's table", _ours(" --size-table TABLE.json"), {YCBV: (4.85,)}),
+            Row("llama-3.1", "Ours, Llama-3.1-8B's table", _ours(" --size-table TABLE.json"), {YCBV: (16.92,)}),
+            Row("gemma-2", "Ours, Gemma2-9B's table", _ours(" --size-table TABLE.json"), {YCBV: (6.98,)}),
+            Row("oracle", "Oracle", _ours(" --sizes true"), {YCBV: (45.95,)}),
         ),
     ),
     "proposals": Table(
@@ -188,9 +197,14 @@ TABLES: dict[str, Table] = {
                 "run CNOS and give its segmentation JSON and poses",
                 {YCBV: (118.55, 61.60, 71.80, 34.0)},
             ),
-            Row("ours", "Ours (the paper's networks)", _WEIGHTS + _ours(), {YCBV: (14.42, 69.70, 76.70, 6.0)}),
-            Row("classical", "Ours, classical segmenter", _ours()),
-            Row("truth", "True masks", _ours("--oracle masks"), {YCBV: (16.65, 100.0, 100.0)}),
+            Row(
+                "ours",
+                "Ours (the paper's networks)",
+                _ours(" --masks proposed", network=_PAPER),
+                {YCBV: (14.42, 69.70, 76.70, 6.0)},
+            ),
+            Row("classical", "Ours, classical segmenter", _ours(" --masks proposed")),
+            Row("truth", "True masks", _ours(), {YCBV: (16.65, 100.0, 100.0)}),
         ),
     ),
     "video": Table(

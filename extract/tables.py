@@ -90,7 +90,7 @@ def as_text(table: Mapping[str, Any]) -> str:
         if any(value is not None for value in row["measured"].values()):
             lines.append(_line(f"  {where}", row["measured"], columns, margin, width))
         if row["how"] and not row["files"]:
-            lines.append(f"  not measured; to fill it: {row['how']}, then --results {row['key']}=FILE")
+            lines.append(f"  not measured; to fill it: {row['how']}; then --results {row['key']}=FILE")
     return "\n".join(lines)
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tyro
 from vid2demo import cli
 from vid2demo.extract.bop import ImageKey
 from vid2demo.extract.bop_results import Estimate, write_results
@@ -57,6 +58,15 @@ def test_every_row_without_figures_says_what_fills_it(name: str) -> None:
         assert row["title"] in text
         assert not row["how"] or f"--results {row['key']}=FILE" in text
     assert len({row.key for row in TABLES[name].rows}) == len(TABLES[name].rows)
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_the_commands_that_fill_a_row_exist_as_they_are_written(name: str) -> None:
+    for row in TABLES[name].rows:
+        for command in (part.split() for part in row.how.split("; ") if part.startswith("vid2demo ")):
+            called = next(words for words in (" ".join(command[1:3]), command[1]) if words in cli.COMMANDS)
+            words = command[1 + len(called.split()) :]
+            assert tyro.cli(cli.COMMANDS[called], args=words, config=(tyro.conf.FlagCreatePairsOff,)) is not None
 
 
 @pytest.mark.skipif(not PAPER.exists(), reason="needs ../shared")
