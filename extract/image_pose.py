@@ -16,7 +16,7 @@ from .geometry import Array
 from .mesh_store import About, MeshStore, StoredMesh
 from .protocols import Box, DepthEstimator, Image, Mask, PatchFeatures, Proposal
 from .retrieval import BEST_VIEWS, SHORT_LIST, Hit, Look, Retriever, look_at_object
-from .scale import scene_sizes
+from .scale import SizeReader, scene_sizes
 from .segment import mask_box
 from .size_table import SizeTable, own_table
 
@@ -71,11 +71,15 @@ class ImagePoser:
         column: str | None = None,
         depth: DepthEstimator | None = None,
         table: SizeTable | None = None,
+        words: SizeReader | None = None,
     ) -> None:
-        """column: descriptor for retrieval.  depth: compares the objects' sizes, where there are several."""
+        """column: descriptor for retrieval.  depth: compares the objects' sizes, where there are several.
+
+        words: reads usual sizes off the pictures, as the paper does; without it the retrieved mesh tells them.
+        """
         self.store, self.features, self.settings = store, features, settings
         self.retriever = Retriever(store, column)
-        self._depth, self._table = depth, table or own_table()
+        self._depth, self._table, self._words = depth, table or own_table(), words
         self._meshes: dict[str, StoredMesh] = {}
 
     def pose(
@@ -99,11 +103,11 @@ class ImagePoser:
             self._hits(look, text) if keys is None else [self._known(keys[k])]
             for k, look in zip(shown, looks, strict=True)
         ]
-        guessed = [self.size_of(found[0].about) for found in hits]
+        masks = [proposals[k].mask for k in shown]
         if sizes_m is not None:
             sizes = [(float(sizes_m[k]), "given") for k in shown]
         else:
-            sizes = self._reconciled(rgb, [proposals[k].mask for k in shown], camera_matrix, guessed)
+            sizes = self._reconciled(rgb, masks, camera_matrix, self._guessed(rgb, masks, hits))
         return [
             self._best(proposals[k], look, found, size, camera_matrix)
             for k, look, found, size in zip(shown, looks, hits, sizes, strict=True)
@@ -135,6 +139,13 @@ class ImagePoser:
 
     def _known(self, key: str) -> Hit:
         return Hit(key, self.mesh(key).about, 1.0)
+
+    def _guessed(self, rgb: Image, masks: Sequence[Mask], hits: Sequence[Sequence[Hit]]) -> list[tuple[float, str]]:
+        """What such things usually measure [m], and who says so, object by object."""
+        if self._words is None or not masks:
+            return [self.size_of(found[0].about) for found in hits]
+        read = self._words.guess(rgb, masks, [mask_box(mask) for mask in masks])
+        return [(guess.size_m, guess.source) for guess in read]
 
     def _reconciled(
         self, rgb: Image, masks: Sequence[Mask], camera_matrix: Array, guessed: Sequence[tuple[float, str]]

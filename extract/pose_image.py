@@ -20,8 +20,10 @@ from .geometry import Array, focal_prior_camera_matrix
 from .image_pose import ImagePoser, PoseSettings
 from .masks import read_mask
 from .mesh_store import MeshStore
+from .model_folder import models_folder
 from .pose_output import write_poses
-from .protocols import Box, DepthEstimator, Image, Proposal, Segmenter
+from .protocols import Box, DepthEstimator, Image, Proposal, Segmenter, TextImageEncoder
+from .scale import SizeReader
 from .segment import check_box, mask_box
 
 
@@ -52,12 +54,14 @@ def pose_picture(settings: PictureSettings, store: MeshStore, out: Path) -> dict
     features = features_of(store.encoder, options)
     kind: dict[str, Any] = {"level": settings.level, "models_dir": settings.models_dir}
     depth = choose("depth", lambda: None, **kind)
-    poser = ImagePoser(store, features, PoseSettings(meshes=max(settings.meshes, 1)), depth=_estimator(depth.made))
+    words = choose("words", _no_words, **kind)
+    chosen = PoseSettings(meshes=max(settings.meshes, 1))
+    poser = ImagePoser(store, features, chosen, depth=_estimator(depth.made), words=_reader(words.made, settings))
     start = time.perf_counter()
     proposals, line = _proposals(rgb, settings, kind)
     poses = poser.pose(rgb, proposals, camera_matrix, text=settings.text)
     seconds = time.perf_counter() - start
-    size = depth.line() if depth.made is not None else f"sizes: of the meshes and the size table ({depth.why})"
+    size = f"{depth.line()}, {words.line()}"
     header = {"image": str(settings.image), "database": str(store.root), "encoder": store.encoder}
     return write_poses(out, rgb, camera_matrix, poser, poses, seconds, {**header, "segmenter": line, "size": size})
 
@@ -79,6 +83,15 @@ def _camera_matrix(camera: Box | None, width: int, height: int) -> Array:
     if not (np.isfinite(camera).all() and fx > 0 and fy > 0):
         raise UserError(f"--camera {fx:g} {fy:g} {cx:g} {cy:g} is no camera; give FX FY CX CY in px, the first two > 0")
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
+def _no_words() -> TextImageEncoder | None:
+    """Without a network no picture is read: the retrieved meshes tell their sizes."""
+    return None
+
+
+def _reader(encoder: TextImageEncoder | None, settings: PictureSettings) -> SizeReader | None:
+    return None if encoder is None else SizeReader(encoder, cache=models_folder(settings.models_dir))
 
 
 def _estimator(made: DepthEstimator | None) -> DepthEstimator | None:

@@ -7,13 +7,16 @@ and s_i = rho r_i. All sizes here are largest FULL extents; the reference code's
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from .files import atomic_path
 from .geometry import Array
 from .protocols import Box, Floats, Image, Mask, TextImageEncoder
 from .size_table import SizeTable, own_table, prompt
@@ -146,9 +149,16 @@ def guess_from_words(words: str, table: SizeTable | None = None) -> SizeGuess:
 class SizeReader:
     """Reads the sizes of objects off their pictures: the median size of the K phrases most like each of them."""
 
-    def __init__(self, encoder: TextImageEncoder, table: SizeTable | None = None, neighbours: int = NEIGHBOURS) -> None:
+    def __init__(
+        self,
+        encoder: TextImageEncoder,
+        table: SizeTable | None = None,
+        neighbours: int = NEIGHBOURS,
+        cache: Path | None = None,
+    ) -> None:
+        """cache: a folder that keeps the vectors of the phrases, which take a large network on a CPU minutes."""
         self._encoder, self._table, self._count = encoder, table or own_table(), neighbours
-        self._texts = encoder.encode_texts([prompt(phrase) for phrase in self._table.phrases])
+        self._texts = _encoded(encoder, [prompt(phrase) for phrase in self._table.phrases], cache)
 
     def guess(self, rgb: Image, masks: Sequence[Mask], boxes_xywh_px: Sequence[Box]) -> list[SizeGuess]:
         """What the table says of each object: (H, W, 3) picture, K masks and boxes."""
@@ -165,3 +175,17 @@ class SizeReader:
             source = f"the {len(nearest)} phrases of {self._table.name} most like it"
             guesses.append(SizeGuess(size, tuple(phrases[k] for k in nearest), source))
         return guesses
+
+
+def _encoded(encoder: TextImageEncoder, texts: Sequence[str], cache: Path | None) -> Floats:
+    """(N, D) vectors of texts, from the cache where it has those of these texts by this encoder."""
+    if cache is None:
+        return encoder.encode_texts(texts)
+    key = hashlib.sha256("\n".join([encoder.name, *texts]).encode()).hexdigest()[:16]
+    path = cache / f"texts-{key}.npy"
+    if path.is_file():
+        return np.asarray(np.load(path, allow_pickle=False), np.float32)
+    vectors = encoder.encode_texts(texts)
+    with atomic_path(path) as temporary:
+        np.save(temporary, vectors)
+    return vectors

@@ -239,6 +239,23 @@ def test_model_reads_the_median_size_of_the_11_likeliest_phrases(tiny_models: Pa
         assert guess.source == "the 11 phrases of part most like it"
 
 
+def test_vectors_of_the_phrases_are_kept(tiny_models: Path, tmp_path: Path) -> None:
+    """Read again by the same network; another network or another table has its own."""
+    encoder = NeuralWords("clip-large", models_dir=tiny_models, device="cpu")
+    other = NeuralWords("siglip-base", models_dir=tiny_models, device="cpu")
+    table = SizeTable("part", own_table().entries[:40])
+    picture = np.random.default_rng(0).integers(0, 256, (40, 40, 3), dtype=np.uint8)
+    asked = (picture, [np.ones((40, 40), bool)], [(0.0, 0.0, 40.0, 40.0)])
+    first = SizeReader(encoder, table, cache=tmp_path).guess(*asked)
+    (kept,) = tmp_path.iterdir()
+    assert np.load(kept).shape == (40, encoder.size)
+    assert SizeReader(encoder, table, cache=tmp_path).guess(*asked) == first == SizeReader(encoder, table).guess(*asked)
+    assert len(list(tmp_path.iterdir())) == 1
+    SizeReader(other, table, cache=tmp_path)
+    SizeReader(encoder, SizeTable("less", table.entries[:30]), cache=tmp_path)
+    assert len(list(tmp_path.iterdir())) == 3
+
+
 def test_small_tables_are_read_whole(tiny_models: Path) -> None:
     encoder = NeuralWords("clip-large", models_dir=tiny_models, device="cpu")
     table = SizeTable("two", (SizeEntry("mug", 0.1, 0.1, 0.1), SizeEntry("kettle", 0.3, 0.3, 0.3)))
