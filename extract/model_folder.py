@@ -147,12 +147,18 @@ def pull(card: ModelCard, folder: Path | None = None) -> Path:
 
 def _hub_cache(card: ModelCard) -> Path | None:
     """The snapshot in the hub's cache at the card's revision (its last known one where the card has none)."""
+    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    home = os.environ.get("HF_HOME") or Path(base) / "huggingface"
+    cache = Path(os.environ.get("HF_HUB_CACHE") or Path(home) / "hub").expanduser()
+    # Looked at first: the hub's package takes half a second to load, and most machines have nothing there.
+    if not (cache / f"models--{card.repository.replace('/', '--')}").is_dir():
+        return None
     if importlib.util.find_spec("huggingface_hub") is None:
         return None
     from huggingface_hub import try_to_load_from_cache
 
     first = card.checkpoint or "config.json"
-    found = try_to_load_from_cache(card.repository, first, revision=card.revision)
+    found = try_to_load_from_cache(card.repository, first, cache_dir=cache, revision=card.revision)
     return Path(found).parent if isinstance(found, str) else None
 
 

@@ -82,6 +82,20 @@ def test_shards_must_all_be_there(tiny_models: Path, tmp_path: Path) -> None:
     assert require_folder(model_card("clip-bigg"), tmp_path) == folder
 
 
+def test_what_the_hubs_own_tools_fetched_is_found(
+    tiny_models: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    card = model_card("dinov2-small")
+    monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path / "hub"))
+    repository = tmp_path / "hub/models--facebook--dinov2-with-registers-small"
+    shutil.copytree(tiny_models / "dinov2-small", repository / "snapshots" / COMMIT)
+    found, where = find_folder(card, tmp_path / "none")
+    assert found == repository / "snapshots" / COMMIT
+    assert where.startswith("the hub's cache")
+    (repository / "snapshots" / COMMIT).rename(repository / "snapshots" / ("0" * 40))  # another revision
+    assert find_folder(card, tmp_path / "none")[0] is None
+
+
 def test_damaged_configuration_is_named(tiny_models: Path, tmp_path: Path) -> None:
     shutil.copytree(tiny_models / "clip-large", tmp_path / "clip-large")
     (tmp_path / "clip-large/config.json").write_text("{")
