@@ -75,7 +75,7 @@ def learn_background(frames: Sequence[Image]) -> Background | None:
     return Background(np.ascontiguousarray(rgb), known)
 
 
-def _second_is_background(modes: Image, settled: NDArray[np.bool_], when: Array) -> NDArray[np.bool_]:
+def _second_is_background(modes: Image, settled: NDArray[np.bool_], when: NDArray[np.float32]) -> NDArray[np.bool_]:
     """(H, W) where the second of the two modes (2, H, W, 3) goes on into the settled surroundings, not the first.
 
     Places that were left and places that were taken are told apart by the order of their modes, `when` (2, H, W).

@@ -72,7 +72,7 @@ def reach_from_border(moving: Mask) -> NDArray[np.int32]:
     while front.any():
         reach[front > 0] = step
         step += 1
-        grown = cv2.dilate(seen, np.ones((3, 3), np.uint8)) & inside
+        grown = np.asarray(cv2.dilate(seen, np.ones((3, 3), np.uint8)), np.uint8) & inside
         front, seen = grown & ~seen, grown
     reach[(inside > 0) & (reach == 0)] = step
     return reach
@@ -84,10 +84,11 @@ def _grown(seed: Mask, within: Mask, code: NDArray[np.int32]) -> Mask:
         return seed
     ours, rest = (_histogram(code[m]) for m in (seed, within & ~seed))
     alike = within & ((ours / (ours + rest + 1e-9))[code] > ALIKE)
-    alike = cv2.morphologyEx(alike.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)) & within
-    _, part = cv2.connectedComponents(np.maximum(alike, seed.astype(np.uint8)), connectivity=4)
-    joined = np.unique(part[seed & (alike > 0)])
-    return np.asarray(np.isin(part, joined[joined > 0]) & (alike > 0))
+    closed = cv2.morphologyEx(alike.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+    alike = (np.asarray(closed) > 0) & within
+    _, part = cv2.connectedComponents((alike | seed).astype(np.uint8), connectivity=4)
+    joined = np.unique(part[seed & alike])
+    return np.asarray(np.isin(part, joined[joined > 0]) & alike)
 
 
 def _parts(mask: Mask) -> Mask:

@@ -90,7 +90,7 @@ def extract(
         raise UserError(f"--start-frame {start_frame}: {info.path} has the frames 0 to {info.frame_count - 1}")
     camera_matrix, camera_source = _camera_matrix(info, camera)
     longest = max(info.width_px, info.height_px)
-    scales = (min(1.0, side / longest) for side in (STARTING_SIDE_PX, WORKING_SIDE_PX))
+    start_scale, scale = (min(1.0, side / longest) for side in (STARTING_SIDE_PX, WORKING_SIDE_PX))
     for request in requests:
         if request.box_xywh_px is not None:
             check_box(request.box_xywh_px, info.width_px, info.height_px)
@@ -99,7 +99,7 @@ def extract(
     report(0, info.frame_count, "looking for " + " and ".join(request.name for request in requests))
     samples = [frame.rgb for frame in sample_frames(info, SAMPLES, WORKING_SIDE_PX)]
     background = None if camera_motion == "moving" else learn_background(samples)
-    scene = _Scene(info, camera_matrix, *scales, samples, background)
+    scene = _Scene(info, camera_matrix, start_scale, scale, samples, background)
     index, sharp, starts = _find(scene, requests, models, start_frame)
     clip = Clip(info, index, _small(sharp, scene), scene.camera(scene.scale))
     starts = [sharpened(start, sharp, scene.camera(scene.start_scale)) for start in settle_rivals(clip, starts)]

@@ -175,7 +175,7 @@ def mask_evidence(mask: NDArray[np.bool_]) -> tuple[NDArray[np.int32], ColourMod
 def colour_bins(rgb: Image) -> NDArray[np.int32]:
     """(H, W) histogram bin of every pixel."""
     bins = np.empty(rgb.shape[:2], np.int32)
-    count_bins(cv2.cvtColor(rgb, cv2.COLOR_RGB2LAB), BITS, CHROMA_STEP, bins)
+    count_bins(np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2LAB), np.uint8), BITS, CHROMA_STEP, bins)
     return bins
 
 

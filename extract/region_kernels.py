@@ -55,9 +55,9 @@ def count_bins(lab: NDArray[np.uint8], bits: int, chroma_step: int, bins: NDArra
     shift, side = 8 - bits, 1 << bits
     for y in range(lab.shape[0]):
         for x in range(lab.shape[1]):
-            a = min(max((np.int32(lab[y, x, 1]) - 128) // chroma_step + side // 2, 0), side - 1)
-            b = min(max((np.int32(lab[y, x, 2]) - 128) // chroma_step + side // 2, 0), side - 1)
-            bins[y, x] = ((np.int32(lab[y, x, 0]) >> shift) << (2 * bits)) | (a << bits) | b
+            a = min(max((int(lab[y, x, 1]) - 128) // chroma_step + side // 2, 0), side - 1)
+            b = min(max((int(lab[y, x, 2]) - 128) // chroma_step + side // 2, 0), side - 1)
+            bins[y, x] = ((int(lab[y, x, 0]) >> shift) << (2 * bits)) | (a << bits) | b
 
 
 @numba.njit(cache=True)

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..demos.attempt import failure_reason
 from ..demos.rollout import DEFAULT_ENV_ID, Controller, make_env, roll_out
-from ..envs.pouring import PhysicsError
+from ..envs.diverged import PhysicsError
 from ..extract.errors import UserError
 from ..extract.stages import Progress, plain, versions
 
