@@ -27,7 +27,7 @@ from .tracker import Estimate, ObjectTracker
 from .vessels import Vessel
 from .video import Image
 
-GLIMPSES = 40  # frames kept for the spin
+GLIMPSES = 30  # frames kept for the spin
 FIT_VIEWS = 6  # frames that the shape is fitted to
 SECOND_LOOK_RAD = np.deg2rad(60)  # most that a second look at the spin may change: it mends, it does not turn round
 SURE = 0.5  # least confidence of a frame that the shape may be fitted to
@@ -146,8 +146,10 @@ class Followed:
         if len(glimpses) < 2:
             return poses
         at = np.array([g.index for g in glimpses])
-        scores = [turn_scores(light, poses[g.index], camera, g.evidence, g.near_edge, axis) for g in glimpses]
-        return turned(poses, at, best_turns(poses[at], np.stack(scores), within_rad), axis)
+        scores = [
+            turn_scores(light, poses[g.index], camera, g.evidence, g.near_edge, axis, within_rad) for g in glimpses
+        ]
+        return turned(poses, at, best_turns(poses[at], np.stack(scores)), axis)
 
     def _fitted(self, poses: Array, vessel: Vessel) -> tuple[Vessel, Array]:
         """The vessel fitted to several frames, and its poses in all; unchanged if that is no better."""

@@ -21,6 +21,7 @@ from .region import ColourModel, TrackingMesh
 
 SPINS = 36
 EVIDENCE_RANGE = (-1.0, 2.0)  # log-odds; skin over a handle must not outvote the frames that show the handle
+SPIN_RAD = 2 * np.pi * np.minimum(np.arange(SPINS), SPINS - np.arange(SPINS)) / SPINS  # from none
 TURN_COST = 0.07  # of a change by one step between neighbouring samples, in mean log-odds over the object's area
 MOST_STEPS = 6  # a change by more costs no more: hands may be quick
 OUTER_WEIGHT, INNER_WEIGHT = 0.3, 0.15  # of edges along the outline and inside it, against the colours
@@ -41,16 +42,21 @@ def turn_scores(
     evidence: NDArray[np.float32],
     edges: NDArray[np.float32] | None = None,
     axis_xy_m: tuple[float, float] = (0.0, 0.0),
+    within_rad: float = np.pi,
 ) -> Array:
     """(2, SPINS) how well every spin of a pose, and of its mirror image in depth, explains a picture.
 
     evidence: (H, W) from `object_evidence`.  edges: (H, W) strength of image edges near each pixel, in [0, 1].
     All are divided by one area, so that covering more of the object's colours counts.
+    within_rad: no spin is farther than this from none, and nothing is mirrored when it is less than half a turn: what
+    is left out is -inf.
     """
     strength = np.zeros((0, 0), np.float32) if edges is None else edges
     sums = np.zeros((2, SPINS, 6))
+    asked = np.broadcast_to(within_rad + 1e-9 >= SPIN_RAD, (2, SPINS)).copy()
+    asked[1] &= within_rad >= np.pi
     for m, pose in enumerate((T, mirrored(T))):
-        for k in range(SPINS):
+        for k in np.flatnonzero(asked[m]):
             at = spun(pose, 2 * np.pi * k / SPINS, axis_xy_m)
             window = render_depth(mesh.vertices_m, mesh.faces, at, camera_matrix)
             if window is not None:
@@ -59,23 +65,19 @@ def turn_scores(
     covered, area, outer, rim, inner, contour = np.moveaxis(sums, -1, 0)
     rim = np.maximum(rim, 1.0)
     edge = OUTER_WEIGHT * outer / rim + INNER_WEIGHT * (inner - EXPECTED * contour) / rim
-    return np.asarray(covered / max(float(area.mean()), 1.0) + (0.0 if edges is None else edge))
+    scores = covered / max(float(area[asked].mean()), 1.0) + (0.0 if edges is None else edge)
+    return np.where(asked, scores, -np.inf)
 
 
-def best_turns(T: Array, scores: Array, within_rad: float = np.pi) -> Array:
+def best_turns(T: Array, scores: Array) -> Array:
     """(M, 3, 3) turns to apply to M poses, in each one's object frame, that maximise the scores less the changing.
 
     T: (M, 4, 4).  scores: (M, 2, SPINS) from `turn_scores`.
-    within_rad: no spin is farther than this from none, and nothing is mirrored when it is less than half a turn.
     """
-    angle_rad = 2 * np.pi * np.minimum(np.arange(SPINS), SPINS - np.arange(SPINS)) / SPINS
-    scores = np.where(angle_rad <= within_rad + 1e-9, scores, -np.inf)
     spins = Rotation.from_rotvec([[0.0, 0.0, 2 * np.pi * k / SPINS] for k in range(SPINS)]).as_matrix()
     plain = np.broadcast_to(spins, (len(T), SPINS, 3, 3))
     flips = np.stack([pose[:3, :3].T @ mirrored(pose)[:3, :3] for pose in T])
     turns = np.concatenate([plain, np.einsum("mij,kjl->mkil", flips, spins)], axis=1)
-    if within_rad < np.pi:
-        turns, scores = turns[:, :SPINS], scores[:, :1]
     scores = scores.reshape(len(T), -1)
     total, back = scores[0].copy(), np.zeros(scores.shape, int)
     for m in range(1, len(scores)):
