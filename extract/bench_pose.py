@@ -17,9 +17,11 @@ from .features import features_of
 from .files import write_json
 from .image_pose import ImagePoser
 from .mesh_store import MeshStore
+from .model_folder import models_folder
 from .progress import Progress
 from .proposal_metrics import ProposedMask, write_proposals
-from .size_table import load_size_table
+from .scale import SizeReader
+from .size_table import load_size_table, own_table
 
 
 def bench_pose(
@@ -46,12 +48,14 @@ def bench_pose(
     opened, store = open_dataset(dataset, split), MeshStore.open(db, encoder, views)
     options = {"models_dir": str(models_dir)} if models_dir else {}
     kind: dict[str, Any] = {"level": level, "models_dir": models_dir}
-    depth = choose("depth", lambda: None, **kind).made
+    depth, words = choose("depth", lambda: None, **kind).made, choose("words", lambda: None, **kind).made
     proposed = masks == "proposed"
-    table = None if size_table is None else load_size_table(size_table)
+    table = own_table() if size_table is None else load_size_table(size_table)
+    reader = None if words is None else SizeReader(words, table, cache=models_folder(models_dir))
+    features = features_of(store.encoder, options)
     found = pose_dataset(
         opened,
-        ImagePoser(store, features_of(store.encoder, options), column=descriptor, depth=depth, table=table),
+        ImagePoser(store, features, column=descriptor, depth=depth, table=table, words=reader),
         out / "poses.csv",
         segmenter=choose("segmenter", ClassicalSegmenter, **kind).made if proposed else None,
         meshes=meshes,
