@@ -152,6 +152,62 @@ class MeshesShow(Command):
 
 
 @dataclass(frozen=True, kw_only=True)
+class MeshesFind(Command):
+    """Find the meshes most like an object that a video shows: it is masked all the way, and its frames vote.
+
+    For example: vid2demo meshes find coffee.mp4 --box 345 297 488 342 --db runs/meshes
+    """
+
+    video: Positional[Annotated[Path, arg(metavar="VIDEO", help="The clip.")]]
+    db: Database = None
+    encoder: Encoder = None
+    views: Views = None
+    box: Annotated[Box | None, told("X Y W H", "The object's box in the first frame [px].")] = None
+    mask: Annotated[Path | None, told("PNG", "The object in the first frame, white on black.")] = None
+    object: Annotated[str | None, told("WORD", "Look only among meshes that this names.")] = None
+    frames: Annotated[int, arg(metavar="N", help="Frames that vote, spread over the video [count].")] = 30
+    level: Annotated[
+        Literal["auto", "foundation", "classical"], arg(help="Networks where their weights are at hand, or not.")
+    ] = "auto"
+    models_dir: ModelsDir = None
+
+    def do(self) -> Result:
+        from .choose import choose
+        from .classical_segment import ClassicalSegmenter
+        from .features import features_of
+        from .find_mesh import find_in_video
+        from .protocols import Segmenter
+        from .retrieval import Retriever
+
+        def classical() -> Segmenter:
+            return ClassicalSegmenter()
+
+        with Terminal() as terminal:
+            store = _opened(self.db, self.encoder, self.views) if self.db else _library(terminal)
+        chosen = choose("segmenter", classical, level=self.level, models_dir=self.models_dir)
+        options = {"models_dir": str(self.models_dir)} if self.models_dir else {}
+        found = find_in_video(
+            self.video,
+            Retriever(store),
+            features_of(store.encoder, options),
+            chosen.made,
+            box_xywh_px=self.box,
+            mask_file=self.mask,
+            text=self.object,
+            frames=self.frames,
+        )
+        meshes = [
+            {"name": hit.about.name, "category": hit.about.category, "score": round(hit.score, 4), "key": hit.key}
+            for hit in found.hits
+        ]
+        return {"segmenter": chosen.line(), "frames": list(found.frames), "meshes": meshes}
+
+    def words(self, result: Result) -> str:
+        rows = [f"{m['score']:.3f}  {m['name']:<28} {m['category']}" for m in result["meshes"]]
+        return "\n".join([result["segmenter"], f"{len(result['frames'])} frames voted", *rows])
+
+
+@dataclass(frozen=True, kw_only=True)
 class MeshesCheck(Command):
     """Check that every mesh, every record of views and every row of a database is what its name says.
 
@@ -250,6 +306,7 @@ COMMANDS: Commands = {
     "meshes onboard": MeshesOnboard,
     "meshes list": MeshesList,
     "meshes show": MeshesShow,
+    "meshes find": MeshesFind,
     "meshes check": MeshesCheck,
     "pose": Pose,
 }

@@ -27,6 +27,7 @@ from vid2demo.extract.protocols import Proposal, Segmenter
 from vid2demo.extract.segment import mask_box
 from vid2demo.extract.shading import render_picture
 from vid2demo.extract.templates import ViewSettings
+from vid2demo.extract.video import VideoWriter
 
 CAMERA = np.array([[600.0, 0.0, 320.0], [0.0, 600.0, 240.0], [0.0, 0.0, 1.0]])
 T_CAMERA_TABLE = invert_pose(look_at(np.array([0.0, -0.8, 0.45]), np.array([0.0, 0.0, 0.05]), np.array([0, 0, 1.0])))
@@ -229,3 +230,24 @@ def test_a_data_set_is_posed_with_retrieved_and_with_true_meshes(root: Path, sce
         assert iou(drawn, masks[name]) > 0.8
     with pytest.raises(UserError, match="no obj_000001"):
         pose_dataset(dataset, ImagePoser(MeshStore.open(root), ClassicalFeatures()), tmp_path / "x.csv", meshes="true")
+
+
+def test_a_video_finds_the_mesh_it_shows(root: Path, scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:  # type: ignore[no-untyped-def]
+    """Half-way the object is hidden for good; the frames that still show it vote."""
+    rgb, masks, _ = scene
+    video = tmp_path / "clip.mp4"
+    with VideoWriter(video, 10.0) as writer:
+        for k in range(8):
+            frame = np.roll(rgb, 5 * k, axis=1)
+            frame[:, : 400 if k >= 6 else 0] = (150, 120, 90)
+            writer.write(frame)
+    box = [str(round(v)) for v in mask_box(masks["saucepan"])]
+    words = ["meshes", "find", str(video), "--db", str(root), "--level", "classical", "--frames", "4", "--json"]
+    assert main([*words, "--box", *box]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["meshes"][0]["category"] == "saucepan"
+    assert len(told["meshes"]) == 3
+    assert set(told["frames"]) <= {0, 2, 5, 7}
+    assert len(told["frames"]) >= 2
+    assert main([*words]) == 2
+    assert "either --box" in capsys.readouterr().err
