@@ -293,13 +293,18 @@ def _opened(db: Path, encoder: str | None, views: int | None) -> MeshStore:
 
 def _library(terminal: Terminal) -> MeshStore:
     """The vessels that ship as a database, made in the user's cache when it is not there yet."""
+    from .features import ClassicalFeatures
     from .mesh_sources import library_sources
     from .mesh_store import MeshStore
     from .onboarding import onboard
+    from .templates import ViewSettings
 
     root = Path(os.environ.get("VID2DEMO_LIBRARY") or Path.home() / ".cache" / "vid2demo" / "library")
-    onboard(library_sources(3), root, workers=os.cpu_count() or 1, progress=terminal.progress)
-    return MeshStore.open(root)
+    sources = library_sources(3)
+    store = MeshStore.create(root, ViewSettings(), ClassicalFeatures())
+    if len(store.keys()) < len(sources):
+        onboard(sources, root, workers=os.cpu_count() or 1, progress=terminal.progress)
+    return store
 
 
 COMMANDS: Commands = {

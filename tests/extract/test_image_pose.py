@@ -251,3 +251,20 @@ def test_a_video_finds_the_mesh_it_shows(root: Path, scene, tmp_path: Path, caps
     assert len(told["frames"]) >= 2
     assert main([*words]) == 2
     assert "either --box" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_without_a_database_the_vessels_that_ship_are_one(
+    scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:  # type: ignore[no-untyped-def]
+    few = [s for s in library_sources(1) if s.category == "bottle"]
+    monkeypatch.setattr("vid2demo.extract.mesh_sources.library_sources", lambda variants: few)
+    monkeypatch.setenv("VID2DEMO_LIBRARY", str(tmp_path / "library"))
+    cv2.imwrite(str(tmp_path / "table.png"), scene[0][..., ::-1])
+    box = [str(round(v)) for v in mask_box(scene[1]["bottle"])]
+    words = ["pose", str(tmp_path / "table.png"), "--out", str(tmp_path / "out"), "--level", "classical", "--box", *box]
+    assert main(words) == 0
+    assert capsys.readouterr().out.count("bottle:0") == 1
+    made = {p: p.stat().st_mtime_ns for p in (tmp_path / "library").rglob("*.npy")}
+    assert main(words) == 0
+    assert {p: p.stat().st_mtime_ns for p in (tmp_path / "library").rglob("*.npy")} == made
