@@ -1,6 +1,6 @@
 """Tracking accuracy, speed and memory: a real recording with truth, two real clips read by eye, synthetic pours.
 
-    python bench/tracking.py [--rows mustard_exact ...] [--synthetic 5] [--shared ../shared] [--json FILE]
+    python bench/tracking.py [--rows mustard_exact ...] [--synthetic 5 [--boxes]] [--shared ../shared] [--json FILE]
 
 Every row is a process of its own, so that its memory and its time are its own; set OMP_NUM_THREADS=1 for one core.
 Under each row with truth stand three more on the same clip, since the paper's errors a frame flatter a track that
@@ -60,6 +60,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--rows", nargs="*", metavar="NAME", help="real rows to measure; all when left out")
     parser.add_argument("--synthetic", type=int, default=5, metavar="N", help="synthetic clips, up to 40")
+    parser.add_argument("--boxes", action="store_true", help="give the object's box in the synthetic clips as well")
     parser.add_argument("--shared", type=Path, default=Path(__file__).parents[2] / "shared")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--only", help=argparse.SUPPRESS)  # one row, in this process
@@ -73,7 +74,8 @@ def main() -> None:
     if unknown := [name for name in names if name not in REAL]:
         parser.error(f"no row {', '.join(unknown)}; there are {', '.join(REAL)}")
     # By category first: five clips are five categories.
-    names += [f"{c}:{seed}" for seed in range(5) for c in CATEGORIES][: arguments.synthetic]
+    suffix = ":box" if arguments.boxes else ""
+    names += [f"{c}:{seed}{suffix}" for seed in range(5) for c in CATEGORIES][: arguments.synthetic]
     rows: list[Row] = []
     for name in names:
         command = [sys.executable, __file__, "--only", name, "--shared", str(arguments.shared)]
@@ -138,12 +140,13 @@ def box_turn(data: Path, folder: Path) -> list[Row]:
 
 
 def synthetic(name: str, folder: Path) -> list[Row]:
-    category, seed = name.split(":")
+    category, seed, *given = name.split(":")
     clip = synthesize(category, int(seed), folder)
     truth = load_truth(clip.truth_path)
     box = tuple(float(v) for v in clip.boxes_xywh_px["object"])
-    track, row = _extracted(clip.video, ObjectRequest(category, box), truth.camera_matrix, folder)
-    row["given"] = "category, camera, box"
+    request = ObjectRequest(category, box if given else None)
+    track, row = _extracted(clip.video, request, truth.camera_matrix, folder)
+    row["given"] = "category, camera, box" if given else "category, camera"
     row |= _errors(track, truth, None)
     library = clip.truth.header["mesh"]["library"]
     model = make_vessel(library["category"], None, **library["params"]).mesh
