@@ -5,9 +5,8 @@ Find every object in the start frame, fit its mesh and pose there, follow it thr
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,7 +14,7 @@ import cv2
 import numpy as np
 
 from .background import COVERED, SAMPLES, Background, learn_background
-from .both_ways import Clip, follow_both_ways, settle_rivals
+from .both_ways import Clip, Watched, follow_both_ways, settle_rivals
 from .camera_motion import CameraWatch
 from .candidates import Model, vessel_model
 from .candidates import ObjectRequest as ObjectRequest
@@ -38,8 +37,7 @@ from .video import Image, VideoInfo, iterate_frames, read_video_info, sample_fra
 TRUSTED_CONFIDENCE = 0.6  # mean over the clip, of an object that nobody pointed at
 SURE_OF_CAMERA = 0.5  # median share of the background that agrees on how the camera turned
 SEEN_SHARE = 0.1  # of the clip, least
-GOOD_IOU = 0.75  # of the first frame's silhouette, below which other frames are looked at as well
-OTHER_FRAMES = (15, 45, 120)  # looked at then
+OTHER_FRAMES = (45,)  # looked at when what was found in the first cannot be followed surely
 
 
 @dataclass(frozen=True)
@@ -55,6 +53,21 @@ class _Scene:
 
     def camera(self, scale: float) -> Array:
         return np.asarray(np.diag([scale, scale, 1.0]) @ self.camera_matrix)
+
+
+@dataclass(frozen=True)
+class _Attempt:
+    """The objects as they were found in one frame and followed from there."""
+
+    index: int
+    starts: list[Start]
+    followed: list[Followed]
+    watched: Watched
+
+    @property
+    def sure(self) -> float:
+        """Mean confidence of the handled object."""
+        return float(np.mean([e.confidence for e in self.followed[0].estimates]))
 
 
 def extract(
@@ -100,10 +113,17 @@ def extract(
     samples = [frame.rgb for frame in sample_frames(info, SAMPLES, WORKING_SIDE_PX)]
     background = None if camera_motion == "moving" else learn_background(samples)
     scene = _Scene(info, camera_matrix, start_scale, scale, samples, background)
-    index, sharp, starts = _find(scene, requests, models, start_frame)
-    clip = Clip(info, index, _small(sharp, scene), scene.camera(scene.scale))
-    starts = [sharpened(start, sharp, scene.camera(scene.start_scale)) for start in settle_rivals(clip, starts)]
-    followed, watched = follow_both_ways(clip, starts, report, watch_camera=camera_motion != "static")
+    attempts: list[_Attempt] = []
+    for index, sharp, starts in _found(scene, requests, models, start_frame):
+        clip = Clip(info, index, _small(sharp, scene), scene.camera(scene.scale))
+        starts = [sharpened(start, sharp, scene.camera(scene.start_scale)) for start in settle_rivals(clip, starts)]
+        followed, watched = follow_both_ways(clip, starts, report, watch_camera=camera_motion != "static")
+        attempts.append(_Attempt(index, starts, followed, watched))
+        if starts[0].box_source != "found" or attempts[-1].sure >= TRUSTED_CONFIDENCE:
+            break
+        report(0, info.frame_count, f"looking again for {requests[0].name}, in another frame")
+    best = max(attempts, key=lambda attempt: attempt.sure)
+    index, starts, followed, watched = best.index, best.starts, best.followed, best.watched
     time_s = np.array([watched.times[k] for k in sorted(watched.times)])
     R_first_camera, motion_words = _camera_turns(watched.camera, camera_motion)
 
@@ -152,35 +172,33 @@ def _camera_turns(watch: CameraWatch | None, asked: str) -> tuple[Array | None, 
     return None, {**told, "kind": "static" if motion.static else "moving, not compensated"}
 
 
-def _find(
+def _found(
     scene: _Scene, requests: Sequence[ObjectRequest], models: Sequence[list[Model]], start_frame: int | None
-) -> tuple[int, Image, list[Start]]:
-    """The start frame, its picture at starting size, and the objects in it.
+) -> Iterator[tuple[int, Image, list[Start]]]:
+    """The start frame, its picture at starting size and the objects in it; then others that may show them better.
 
-    Where nobody said which frame, and the first one does not show the objects well, a few others are tried.
+    Others only where nobody said which frame. Raises UserError when the objects are in none of them.
     """
-    first = start_frame or 0
-    tried: list[tuple[float, int, Image, list[Start]]] = []
+    first, found = start_frame or 0, False
     refusal: NotFoundError | None = None
     wanted = [first]
     if start_frame is None and not any(request.pointed_at for request in requests):
         wanted += [k for k in OTHER_FRAMES if k < scene.info.frame_count]
-    for frame in islice(iterate_frames(scene.info.path, STARTING_SIDE_PX, scene.info), wanted[-1] + 1):
-        if frame.index not in wanted:
+    for index in wanted:
+        frames = iterate_frames(scene.info.path, STARTING_SIDE_PX, scene.info)
+        frame = next((frame for frame in frames if frame.index == index), None)
+        if frame is None:  # damaged
             continue
         try:
             starts = _find_in(frame.rgb, scene, requests, models)
         except NotFoundError as error:
             refusal = refusal or error
             continue
-        tried.append((min(start.best.pose.iou for start in starts), frame.index, frame.rgb, starts))
-        if tried[-1][0] > GOOD_IOU:
-            break
-    if not tried:
+        found = True
+        yield frame.index, frame.rgb, starts
+    if not found:
         where = f"in frame {first} of {scene.info.path}"
         raise UserError(f"{refusal} {where}; give its box there with --box X Y WIDTH HEIGHT, or another --start-frame")
-    _, index, sharp, starts = max(tried, key=lambda entry: entry[0])
-    return index, sharp, starts
 
 
 def _find_in(
