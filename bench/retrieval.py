@@ -38,6 +38,7 @@ from vid2demo.extract.templates import ViewSettings, template_view
 
 CLEAR = 0.95  # visible share from which on an object counts as unhidden
 SEARCHES = 15
+MOMENT_STEP = 3  # a third of the views serves moments as well, which know no turn of the picture
 
 
 def moments(mask: Mask) -> NDArray[np.float64]:
@@ -51,7 +52,8 @@ def by_moments(store: MeshStore, index_keys: tuple[str, ...]) -> Callable[[Mask]
     views = []
     for key in index_keys:
         mesh = store.mesh(key).mesh
-        views.append([moments(template_view(mesh, store.settings, k, 120).mask) for k in range(store.settings.count)])
+        some = range(0, store.settings.count, MOMENT_STEP)
+        views.append([moments(template_view(mesh, store.settings, k, 60).mask) for k in some])
     table = np.array(views)
     spread = table.reshape(-1, 7).std(axis=0)
     return lambda mask: -np.linalg.norm((table - moments(mask)) / spread, axis=-1).min(axis=1)

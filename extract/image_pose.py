@@ -32,7 +32,7 @@ class PoseSettings:
     views are drawn too.  over: the cells that equation 1 counts.  best_views, short_list: see `Retriever.retrieve`.
     """
 
-    meshes: int = 2
+    meshes: int = 1
     views: int = 3
     fine: bool = True
     over: Over = "union"

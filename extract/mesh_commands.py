@@ -256,7 +256,7 @@ class Pose(Command):
     camera: Annotated[Box | None, told("FX FY CX CY", "Intrinsics [px]. Default: f = sqrt(w^2 + h^2), centred.")] = None
     object: Annotated[str | None, told("WORD", "Look only among meshes that this names.")] = None
     prompt: Annotated[str, arg(metavar="TEXT", help="What a detector that reads looks for.")] = "objects."
-    meshes: Annotated[int, arg(metavar="N", help="Retrieved meshes that compete by their poses [count].")] = 2
+    meshes: Annotated[int, arg(metavar="N", help="Retrieved meshes that compete by their poses [count].")] = 1
     level: Annotated[
         Literal["auto", "foundation", "classical"], arg(help="Networks where their weights are at hand, or not.")
     ] = "auto"

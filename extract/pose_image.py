@@ -37,7 +37,7 @@ class PictureSettings:
     camera: Box | None = None
     text: str | None = None
     prompt: str = "objects."
-    meshes: int = 2
+    meshes: int = 1
     level: Level = "auto"
     models_dir: Path | None = None
 
