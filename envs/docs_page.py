@@ -94,6 +94,14 @@ generator); `set_state()`, or `reset(options={"state": ...})`, continues exactly
 `envs.as_dm_env(env)` puts an environment behind DeepMind's `dm_env` interface.
 """
 
+_VECTOR = """## Many at once
+
+`gym.make_vec("vid2demo:PandaPour-v0", num_envs=16, ...)` takes the same arguments and gives, for equal seeds and actions,
+bit for bit what single environments give, whatever `num_threads` (one per processor unless given). `autoreset_mode` is
+`NextStep` (default), `SameStep` (`infos` then holds `final_obs` and `final_info`) or `Disabled` (reset what has ended with
+`options={"reset_mask": ...}`). Seeds, infos, `call`, `get_attr`, `set_attr` and `render` are as in `SyncVectorEnv`.
+"""
+
 _HISTORY = """## Version history
 
 * v0: first version.
@@ -158,6 +166,7 @@ def page() -> str:
             [(f"`{name}`", unit, text) for name, (unit, text) in {**INFO, **INFO_SOMETIMES}.items()],
         ),
         _STATE,
+        _VECTOR,
         _HISTORY,
     ]
     return "\n".join(part.rstrip("\n") + "\n" for part in parts)
