@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
 from pathlib import Path
 
@@ -272,3 +273,24 @@ def test_large_and_deep_videos_are_followed(kind: str, mesh_file: Path, tmp_path
     for k in range(4):
         seen = project(track.camera_matrix, track.T_camera_object[k, None, :3, 3])
         assert np.linalg.norm(seen - project(scaled, pose_at(k)[None, :3, 3])) < 5 * factor
+
+
+@pytest.mark.slow
+def test_memory_does_not_grow_with_the_length_of_the_clip(tmp_path: Path) -> None:
+    """Peak memory of a process of its own, over a clip and over one eight times as long."""
+    wedge().export(tmp_path / "wedge.ply")
+    there_and_back = [picture(k) for k in (*range(COUNT), *range(COUNT - 1, -1, -1))]
+    program = (
+        "import resource, sys; from pathlib import Path; from vid2demo.extract.perceive import ObjectRequest, extract; "
+        "box = tuple(float(v) for v in sys.argv[3:7]); mesh = Path(sys.argv[2]); "
+        "extract(Path(sys.argv[1]), [ObjectRequest('wedge', box, mesh=mesh, mesh_unit='m')], out=mesh.parent / 'out'); "
+        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)"
+    )
+    peaks_mb = []
+    for turns in (3, 24):
+        video = write(tmp_path / f"{turns}.mp4", there_and_back * turns)
+        words = [sys.executable, "-c", program, str(video), str(tmp_path / "wedge.ply"), *map(str, box_at(0))]
+        done = subprocess.run(words, capture_output=True, text=True, check=True)
+        peaks_mb.append(float(done.stdout.split()[-1]))
+    # 420 pictures more would be 97 MB.
+    assert peaks_mb[1] < peaks_mb[0] + 30, peaks_mb
