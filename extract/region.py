@@ -30,7 +30,7 @@ from .region_kernels import (
 from .video import Image
 
 BITS = 4  # colour resolution per channel of the local histograms
-CHROMA_STEP = 5  # of Lab's a and b, in a bin
+CHROMA_STEP = 4  # of Lab's a and b, in a bin
 BINS = 1 << (3 * BITS)
 LOCAL_CENTRES = 48
 CLEAR_EDGE = 24.0  # grey levels per px

