@@ -84,7 +84,7 @@ def test_a_lost_file_is_made_again_and_nothing_else(folder: Path) -> None:
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
 def test_a_command_stopped_in_its_midst_leaves_nothing_half_done(tmp_path: Path, how: signal.Signals) -> None:
     out = tmp_path / "clip"
-    words = ["synthesize", "--out", str(out), "--seconds", "4", "--size", "160", "120"]
+    words = ["synthesize", "--out", str(out), "--seconds", "16", "--size", "160", "120"]
     command = [str(Path(sys.executable).with_name("vid2demo")), *words]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     deadline_s = time.monotonic() + 120
