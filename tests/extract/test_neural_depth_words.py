@@ -12,6 +12,8 @@ from vid2demo.extract.neural_depth import NeuralDepth
 from vid2demo.extract.neural_words import NeuralWords, squared
 from vid2demo.extract.protocols import DepthEstimator, TextImageEncoder
 
+pytestmark = pytest.mark.slow  # loading torch and transformers alone takes longer than a fast test may
+
 
 def picture(height: int = 120, width: int = 160, seed: int = 0) -> np.ndarray[Any, np.dtype[np.uint8]]:
     return np.random.default_rng(seed).integers(0, 256, (height, width, 3), dtype=np.uint8)

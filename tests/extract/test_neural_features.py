@@ -14,6 +14,8 @@ from vid2demo.extract.neural_features import NeuralPatchFeatures, prepared
 from vid2demo.extract.protocols import PatchFeatures
 from vid2demo.extract.torch_models import place
 
+pytestmark = pytest.mark.slow  # loading torch and transformers alone takes longer than a fast test may
+
 GRID = 6  # small crops: what is tested does not depend on the size
 
 

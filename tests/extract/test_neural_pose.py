@@ -9,6 +9,8 @@ import pytest
 import trimesh
 from vid2demo.cli import main
 
+pytestmark = pytest.mark.slow  # loading torch and transformers alone takes longer than a fast test may
+
 
 @pytest.mark.slow
 def test_every_network_of_the_paper_takes_its_part_in_a_pose(

@@ -18,6 +18,8 @@ from vid2demo.extract.neural_segment import (
 )
 from vid2demo.extract.protocols import Segmenter
 
+pytestmark = pytest.mark.slow  # loading torch and transformers alone takes longer than a fast test may
+
 HEIGHT, WIDTH = 120, 160
 EVERYTHING = Thresholds(box=0.0, text=0.0, area_px=1, side_px=1)
 Picture = np.ndarray[Any, np.dtype[np.uint8]]

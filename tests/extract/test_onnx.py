@@ -16,6 +16,8 @@ from vid2demo.extract.onnx_export import export_model, metadata
 from vid2demo.extract.onnx_models import OnnxDepth, OnnxPatchFeatures, open_network
 from vid2demo.extract.protocols import DepthEstimator, PatchFeatures
 
+pytestmark = pytest.mark.slow  # loading torch and transformers alone takes longer than a fast test may
+
 GRID = 6
 
 
