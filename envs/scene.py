@@ -23,7 +23,7 @@ from .holding import Grasp, add_grip, set_grasp_options
 from .kinematics import HAND_BODY
 from .liquid import Liquid, add_particles
 from .panda import CONTACT_HELD, CONTACT_PARTICLE, CONTACT_ROBOT, CONTACT_VESSEL, panda_spec
-from .vessel_geometry import STANDING_WALL_M, Box, Cavity, cavity_of, collision_boxes, visual_parts
+from .vessel_geometry import STANDING_WALL_M, Box, Cavity, cavity_of, collision_boxes, convex_hull, visual_parts
 
 if TYPE_CHECKING:
     from ..extract.vessels import Vessel
@@ -159,7 +159,9 @@ def particle_obstacles(model: mujoco.MjModel, body: str) -> list[Box]:
 
 def wxyz(R: Array) -> list[float]:
     """Quaternion of a rotation matrix in MuJoCo's order."""
-    return [float(v) for v in Rotation.from_matrix(R).as_quat(scalar_first=True)]
+    quat = np.empty(4)
+    mujoco.mju_mat2Quat(quat, np.ascontiguousarray(R, float).ravel())
+    return [float(v) for v in quat]
 
 
 def _placed(T: Array) -> dict[str, Any]:
@@ -298,7 +300,7 @@ def _shell_inertia(vessel: Vessel) -> tuple[Array, Array]:
 
 def _add_hull(spec: mujoco.MjSpec, body: mujoco.MjsBody, vessel: Vessel, contact: dict[str, Any]) -> None:
     """What the held vessel touches the table with: the walls for particles reach too far out for that."""
-    hull = vessel.mesh.convex_hull
+    hull = convex_hull(vessel.mesh)
     # The vessel's frame has its origin in the middle of the bounding box.
     shrunk = np.asarray(hull.vertices) * (1.0 - 2.0 * HULL_INSET_M / np.asarray(vessel.extents_m))
     mesh = spec.add_mesh(name=f"{body.name}_hull", uservert=shrunk.ravel(), userface=np.asarray(hull.faces).ravel())

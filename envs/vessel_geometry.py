@@ -9,8 +9,8 @@ overlap at every seam, hence nothing leaks.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -305,8 +305,26 @@ def collision_boxes(vessel: Vessel, cavity: Cavity, wall_m: float = SWUNG_WALL_M
     return boxes
 
 
-def visual_parts(mesh: Any, max_faces: int = 3000) -> list[tuple[tuple[float, ...], Array, NDArray[np.int64]]]:
+@dataclass(frozen=True)
+class _Mesh:
+    """A trimesh told from others by its contents: each vessel brings a copy of its mesh, and most are seen again."""
+
+    contents: tuple[int, ...]
+    mesh: Any = field(compare=False)
+
+    @staticmethod
+    def of(mesh: Any) -> _Mesh:
+        return _Mesh((hash(mesh), hash(mesh.visual.face_colors.tobytes())), mesh)
+
+
+def visual_parts(mesh: Any, max_faces: int = 3000) -> tuple[tuple[tuple[float, ...], Array, NDArray[np.int64]], ...]:
     """(rgba, vertices (V, 3), faces (F, 3)) for each colour of a trimesh, decimated to about `max_faces` in all."""
+    return _visual_parts(_Mesh.of(mesh), max_faces)
+
+
+@lru_cache(maxsize=32)
+def _visual_parts(of: _Mesh, max_faces: int) -> tuple[tuple[tuple[float, ...], Array, NDArray[np.int64]], ...]:
+    mesh = of.mesh
     if len(mesh.faces) > max_faces and _is_speckled(mesh):
         mesh = _decimated_whole(mesh, max_faces)
     colors = np.ascontiguousarray(mesh.visual.face_colors, np.uint8)
@@ -321,7 +339,25 @@ def visual_parts(mesh: Any, max_faces: int = 3000) -> list[tuple[tuple[float, ..
             part = part.simplify_quadric_decimation(face_count=keep)
         rgba = tuple(float(v) / 255 for v in color)
         parts.append((rgba, np.asarray(part.vertices, float), np.asarray(part.faces, np.int64)))
-    return parts
+    return tuple(parts)
+
+
+@lru_cache(maxsize=32)
+def _surface(of: _Mesh) -> Array:
+    """(N, 3) points spread over a mesh."""
+    import trimesh
+
+    return np.asarray(trimesh.sample.sample_surface(of.mesh, 20000, seed=0)[0])
+
+
+def convex_hull(mesh: Any) -> Any:
+    """The hull of a trimesh as one; not to be changed."""
+    return _convex_hull(_Mesh.of(mesh))
+
+
+@lru_cache(maxsize=32)
+def _convex_hull(of: _Mesh) -> Any:
+    return of.mesh.convex_hull
 
 
 def _is_speckled(mesh: Any) -> bool:
@@ -343,10 +379,7 @@ def _decimated_whole(mesh: Any, max_faces: int) -> Any:
 
 def gripper_half_width_m(vessel: Vessel, T_hand_object: Array, pad_m: float = 0.009, limit_m: float = 0.04) -> float:
     """How far each finger stands from the hand's middle when both touch the vessel between the pads, in m."""
-    import trimesh
-
-    surface, _ = trimesh.sample.sample_surface(vessel.mesh, 20000, seed=0)
-    in_hand = surface @ T_hand_object[:3, :3].T + T_hand_object[:3, 3]
+    in_hand = _surface(_Mesh.of(vessel.mesh)) @ T_hand_object[:3, :3].T + T_hand_object[:3, 3]
     between = (
         (np.abs(in_hand[:, 0]) < pad_m) & (np.abs(in_hand[:, 2]) < pad_m) & (np.abs(in_hand[:, 1]) < 1.2 * limit_m)
     )
