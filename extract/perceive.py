@@ -28,7 +28,7 @@ from .masks import read_mask, write_masks
 from .overlay import OverlayItem, write_overlay
 from .progress import Progress
 from .rerun_log import load_rerun, write_rerun
-from .segment import check_box, mask_box
+from .segment import Mask, check_box, mask_box
 from .smoothing import smooth_poses
 from .starting import STARTING_SIDE_PX, WORKING_SIDE_PX, NotFoundError, Start, resized, scaled, sharpened, start_object
 from .track import ObjectTrack
@@ -101,7 +101,7 @@ def extract(
         raise UserError("two objects have the same name; give each its own")
     if start_frame is not None and not 0 <= start_frame < info.frame_count:
         raise UserError(f"--start-frame {start_frame}: {info.path} has the frames 0 to {info.frame_count - 1}")
-    camera_matrix, camera_source = _camera_matrix(info, camera)
+    camera_matrix, camera_source = camera_of_video(info, camera)
     longest = max(info.width_px, info.height_px)
     start_scale, scale = (min(1.0, side / longest) for side in (STARTING_SIDE_PX, WORKING_SIDE_PX))
     for request in requests:
@@ -143,19 +143,26 @@ def extract(
             smooth, time_s, camera_matrix, confidence, visible, header, R_first_camera, raw
         )
 
-    out.mkdir(parents=True, exist_ok=True)
     items = [OverlayItem(track, f.mesh) for track, f in zip(tracks.values(), followed, strict=True)]
-    for start, item in zip(starts, items, strict=True):
+    write_tracks(info, items, [start.best.mask for start in starts], out, rerun=rerun, progress=report)
+    return tracks
+
+
+def write_tracks(
+    info: VideoInfo, items: Sequence[OverlayItem], masks: Sequence[Mask], out: Path, *, rerun: bool, progress: Progress
+) -> None:
+    """Write what `extract` writes. masks: (H, W) of each object in the start frame."""
+    out.mkdir(parents=True, exist_ok=True)
+    for mask, item in zip(masks, items, strict=True):
         name = item.track.name
         item.track.save(out / f"{name}.track.npz")
         write_masks(out / f"{name}.masks.npz", item.track, item.mesh)
         with atomic_path(out / f"{name}.mask.png") as temporary:
-            cv2.imwrite(str(temporary), start.best.mask.astype(np.uint8) * 255)
-    report(info.frame_count, info.frame_count, "drawing the overlay")
+            cv2.imwrite(str(temporary), mask.astype(np.uint8) * 255)
+    progress(info.frame_count, info.frame_count, "drawing the overlay")
     write_overlay(info.path, items, out / "overlay.mp4")
     if rerun:
         write_rerun(info.path, items, out / "extract.rrd")
-    return tracks
 
 
 def _camera_turns(watch: CameraWatch | None, asked: str) -> tuple[Array | None, dict[str, Any]]:
@@ -274,7 +281,8 @@ def _header(request: ObjectRequest, scene: _Scene, start: Start, model: Model, i
     }
 
 
-def _camera_matrix(info: VideoInfo, camera: tuple[float, float, float, float] | None) -> tuple[Array, str]:
+def camera_of_video(info: VideoInfo, camera: tuple[float, float, float, float] | None) -> tuple[Array, str]:
+    """(3, 3) intrinsics in px and where they are from. Raises UserError for ones that no such video has."""
     if camera is None:
         return focal_prior_camera_matrix(info.width_px, info.height_px), "prior"
     fx, fy, cx, cy = camera
