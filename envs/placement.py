@@ -6,7 +6,7 @@ chosen here: the camera's tilt, scale, place and yaw in the workspace, grasp, st
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -125,6 +125,7 @@ def build_reference(
         "scale_chosen": "auto" if scale == "auto" else "given",
         "time_stretch": 1.0,
         "T_world_camera": T_world_camera.tolist(),
+        "changed": {"leaps": [asdict(leap) for leap in resampled.leaps]},
         "settings": {
             "control_hz": control_hz,
             "elevation_deg": elevation_deg,

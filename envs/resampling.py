@@ -1,12 +1,12 @@
 """From a track at the video's own, possibly uneven, frame times to clean poses at the control rate.
 
-Frames the tracker did not see or trust are bridged, jumps there and back are cut out, and the ends get a short hold
+Frames the tracker did not see or trust are bridged, its leaps are taken out (`leaps`), and the ends get a short hold
 and, where the object is already moving, a gentle start, because a robot cannot begin at speed.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +14,9 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from ..extract.errors import UserError
-from ..extract.geometry import Array, rotation_angle_rad
+from ..extract.geometry import Array
 from ..extract.track import ObjectTrack
+from .leaps import Leap, without_leaps
 from .reference import interpolate_poses, spline_poses
 
 Mask = NDArray[np.bool_]
@@ -23,8 +24,6 @@ Mask = NDArray[np.bool_]
 MIN_FRAMES = 4
 MIN_DURATION_S = 0.3
 MAX_TRAVEL_M = 5.0
-# A hand does not move a vessel faster; a tracker that loses it does.
-JUMP_M_S, JUMP_RAD_S, JUMP_FRAMES = 4.0, 20.0, 6
 # Second differences at the control rate (rms) below which jitter is nothing the arm would show.
 JITTER_M, JITTER_RAD = 0.0003, np.deg2rad(0.15)
 SMOOTHING_S = (0.0, 0.03, 0.05, 0.08, 0.12, 0.16)
@@ -36,13 +35,14 @@ class ResampledTrack:
     """Poses at the control rate.
 
     T_camera_object: (N, 4, 4); video_time_s: (N,) the video's clock, not decreasing; confidence: (N,) in [0, 1].
-    notes: what was bridged, cut or added, in plain sentences.
+    notes: what was bridged, cut or added, in plain sentences. leaps: those of the tracker that were bridged.
     """
 
     T_camera_object: Array
     video_time_s: Array
     confidence: Array
     notes: list[str]
+    leaps: list[Leap]
 
 
 def resample_track(
@@ -51,14 +51,14 @@ def resample_track(
     """Poses of a track on knots of `control_hz`, between the first and the last frame that can be trusted.
 
     hold_s: the robot stands still for so long before and after. ease_s: over so long it gathers speed when the track
-    begins or ends in motion. Raises UserError for a track that is too short, never visible or not in metres.
+    begins or ends in motion. Raises UserError for a track that is too short, never visible, not in metres or all leaps.
     """
     if not 1.0 <= control_hz <= 1000.0:
         raise UserError(f"the control rate is {control_hz} Hz; choose one from 1 to 1000")
     _check_units(track)
     notes: list[str] = []
     good = _trusted_frames(track, min_confidence, notes)
-    good &= ~_jump_frames(track, good, notes)
+    track, good, leaps = _without_leaps(track, good, notes)
     first, last = np.flatnonzero(good)[[0, -1]]
     if good.sum() < MIN_FRAMES or track.time_s[last] - track.time_s[first] < MIN_DURATION_S:
         raise UserError(
@@ -83,7 +83,7 @@ def resample_track(
     confidence = np.where(good, track.confidence[inside], 0.0)
     sure = np.interp(video_time_s, time_s, confidence)
     poses = _without_jitter(spline_poses(T, time_s, video_time_s), sure, control_hz, notes)
-    return ResampledTrack(poses, video_time_s, sure, notes)
+    return ResampledTrack(poses, video_time_s, sure, notes, leaps)
 
 
 def _check_units(track: ObjectTrack) -> None:
@@ -114,40 +114,25 @@ def _trusted_frames(track: ObjectTrack, min_confidence: float, notes: list[str])
     return np.asarray(good)
 
 
-def _jump_frames(track: ObjectTrack, good: Mask, notes: list[str]) -> Mask:
-    """Frames between a leap away and a leap back, at most `JUMP_FRAMES` of them."""
+def _without_leaps(track: ObjectTrack, good: Mask, notes: list[str]) -> tuple[ObjectTrack, Mask, list[Leap]]:
+    """The track with its leaps bridged, which frames are good then, and the leaps that did not come back."""
     index = np.flatnonzero(good)
-    T, time_s = track.T_camera_object[index], track.time_s[index]
-    bad = np.zeros(len(track), bool)
-    if len(index) < 3:
-        return bad
-    step_s = np.diff(time_s)
-    speed_m_s = np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1) / step_s
-    speed_rad_s = rotation_angle_rad(T[1:, :3, :3], T[:-1, :3, :3]) / step_s
-    leaps = np.flatnonzero((speed_m_s > JUMP_M_S) | (speed_rad_s > JUMP_RAD_S))
-    paired = 0
-    while paired < len(leaps):
-        here = leaps[paired]
-        partner = leaps[paired + 1] if paired + 1 < len(leaps) else None
-        if partner is not None and partner - here <= JUMP_FRAMES:
-            bad[index[here + 1 : partner + 1]] = True
-            paired += 2
-            continue
-        if here == 0:
-            bad[index[0]] = True
-        elif here == len(index) - 2:
-            bad[index[-1]] = True
-        else:
-            notes.append(
-                f"At {time_s[here]:.2f} s the track leaps by {speed_m_s[here] * step_s[here]:.2f} m and "
-                f"{np.rad2deg(speed_rad_s[here] * step_s[here]):.0f} degrees within one frame and does not come back; "
-                "the robot follows more slowly."
-            )
-        paired += 1
-    if bad.any():
-        when = ", ".join(f"{t:.2f}" for t in track.time_s[bad][:5])
-        notes.append(f"{int(bad.sum())} frames in which the tracker leapt away were cut out (at {when} s).")
-    return bad
+    seen, keep, leaps = without_leaps(track.T_camera_object[index], track.time_s[index], track.confidence[index])
+    if 2 * keep.sum() < len(index):
+        raise UserError(
+            f"the track of {track.name!r} leaps to and fro in {int((~keep).sum())} of its {len(index)} frames, as no "
+            "object does; extract it again, with a --box around it"
+        )
+    T = track.T_camera_object.copy()
+    T[index] = seen
+    if not keep.all():
+        away_s = track.time_s[index[~keep]]
+        when = ", ".join(f"{t:.2f}" for t in away_s[:5])
+        notes.append(f"{len(away_s)} frames in which the tracker leapt away were cut out (at {when} s).")
+    notes += [leap.sentence() for leap in leaps]
+    good = good.copy()
+    good[index[~keep]] = False
+    return replace(track, T_camera_object=T), good, leaps
 
 
 def _video_clock(T: Array, time_s: Array, control_hz: float, hold_s: float, ease_s: float, notes: list[str]) -> Array:
