@@ -43,7 +43,9 @@ class MeshesOnboard(Command):
     block: Annotated[int | None, told("N", "Block whose tokens are taken. Default: as in the paper.")] = None
     models_dir: ModelsDir = None
     variants: Annotated[int, arg(metavar="N", help="Of each category of the library [count].")] = 3
-    workers: Annotated[int, arg(metavar="N", help="Processes [count].")] = 1
+    workers: Annotated[int, arg(metavar="N", help="Processes, or CPUs of a Ray started here [count].")] = 1
+    ray: Annotated[bool, told(None, "Work on the Ray cluster at RAY_ADDRESS, or on one started here.")] = False
+    gpus: Annotated[float, arg(metavar="N", help="Of a Ray task, for networks; may be a share [count].")] = 0.0
 
     def do(self) -> Result:
         from .errors import UserError
@@ -66,6 +68,8 @@ class MeshesOnboard(Command):
                 options=tuple((k, str(v)) for k, v in options.items() if v is not None),
                 unit_name=self.unit,
                 workers=self.workers,
+                ray=self.ray,
+                gpus=self.gpus,
                 progress=terminal.progress,
             )
         return {

@@ -9,16 +9,11 @@ from __future__ import annotations
 import functools
 import json
 import math
-import multiprocessing
-import os
-import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from .errors import UserError
@@ -27,6 +22,7 @@ from .files import write_json
 from .mesh_sources import MeshSource
 from .mesh_store import About, MeshStore, StoredMesh
 from .meshes import METRES_PER_UNIT, guess_unit, load_mesh_of_unknown_size
+from .parallel import in_processes, on_cluster
 from .progress import Progress
 from .protocols import PatchFeatures
 from .templates import ColoredMesh, ViewSettings, template_view
@@ -143,11 +139,14 @@ def onboard(
     options: tuple[tuple[str, str], ...] = (),
     unit_name: str = "auto",
     workers: int = 1,
+    ray: bool = False,
+    gpus: float = 0.0,
     progress: Progress | None = None,
 ) -> Onboarded:
     """Bring meshes into the database at `root`, which is made when missing.
 
-    encoder: a name that `features.make_features` knows, `options` for it.  workers: processes.
+    encoder: a name that `features.make_features` knows, `options` for it.  workers: processes.  ray: work on a cluster
+    (`parallel.on_cluster`) whose machines all see `root` and the meshes under the same paths, each task with `gpus`.
     Raises UserError for a folder that is no database, or that another process writes to.
     """
     store = MeshStore.create(root, settings, make_features(encoder, dict(options)))
@@ -155,7 +154,9 @@ def onboard(
     result = Onboarded()
     with store.only_writer():
         seen: set[str] = set()
-        for done, (job, (state, found)) in enumerate(_in_processes(jobs, workers), start=1):
+        ends = on_cluster(onboard_one, jobs, workers, gpus) if ray else in_processes(onboard_one, jobs, workers)
+        for done, (job, end) in enumerate(ends, start=1):
+            state, found = end or ("failed", "the process at work on it died; it may need more memory than there is")
             name = job.source.name
             if state == "failed":
                 result.failed.append((name, found))
@@ -192,40 +193,3 @@ def _colors(mesh: Any) -> np.ndarray[Any, np.dtype[np.uint8]]:
         colors[np.asarray(mesh.faces).ravel()] = np.repeat(np.asarray(mesh.visual.face_colors)[:, :3], 3, axis=0)
         return colors
     return np.array(np.asarray(mesh.visual.vertex_colors)[:, :3], np.uint8)
-
-
-def _one_thread() -> None:
-    """Many workers, one thread each; none outlives the command, however it ends."""
-    cv2.setNumThreads(1)
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
-
-
-def _end_with(parent: Any) -> None:
-    parent.join()
-    os._exit(1)
-
-
-def _in_processes(jobs: Sequence[Job], workers: int) -> Iterator[tuple[Job, tuple[str, str]]]:
-    if workers <= 1 or len(jobs) <= 1:
-        yield from ((job, onboard_one(job)) for job in jobs)
-        return
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(workers, len(jobs)), mp_context=context, initializer=_one_thread) as pool:
-        yield from _as_they_come(jobs, workers, lambda job: pool.submit(onboard_one, job))
-
-
-def _as_they_come(
-    jobs: Iterable[Job], workers: int, submit: Callable[[Job], Any]
-) -> Iterator[tuple[Job, tuple[str, str]]]:
-    """Results as they are ready; no more than a few jobs wait, so that an interruption ends soon."""
-    waiting: dict[Any, Job] = {}
-    rest = iter(jobs)
-    while True:
-        while len(waiting) < 2 * workers and (job := next(rest, None)) is not None:
-            waiting[submit(job)] = job
-        if not waiting:
-            return
-        for future in wait(waiting, return_when=FIRST_COMPLETED).done:
-            yield waiting.pop(future), future.result()

@@ -162,7 +162,7 @@ def test_everything_imported_is_a_requirement() -> None:
 
     extras = project["optional-dependencies"]
     # An adapter for another project's users asks for that project's package in its own error.
-    own = [r for extra in ("dm", "models", "onnx", "rerun") for r in extras[extra]]
+    own = [r for extra in ("cluster", "dm", "models", "onnx", "rerun") for r in extras[extra]]
     base, dev = names([*project["dependencies"], *own]), names(extras["dev"])
     brought = {"torch", "torchvision", "pandas", "pyarrow", "datasets", "huggingface-hub"}
     above = names([r for extra, rs in extras.items() if extra != "dev" for r in rs]) | brought
