@@ -75,8 +75,12 @@ def render_depth(
 
 @numba.njit(cache=True, fastmath=True)
 def _fill(uv: Array, z: Array, faces: NDArray[np.int32], depth: NDArray[np.float32]) -> None:
-    """Z-buffer with 1/z interpolated linearly on the image plane, which is exact for planes in perspective."""
+    """Z-buffer with 1/z interpolated linearly on the image plane, which is exact for planes in perspective.
+
+    `depth` (h, w), zeros at first, holds 1/z until the end; the largest wins.
+    """
     h, w = depth.shape
+    inverse = 1.0 / z
     for f in range(faces.shape[0]):
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
         ax, ay, bx, by, cx, cy = uv[a, 0], uv[a, 1], uv[b, 0], uv[b, 1], uv[c, 0], uv[c, 1]
@@ -87,13 +91,28 @@ def _fill(uv: Array, z: Array, faces: NDArray[np.int32], depth: NDArray[np.float
         x_b = min(int(np.floor(max(ax, bx, cx))), w - 1)
         y_a = max(int(np.ceil(min(ay, by, cy))), 0)
         y_b = min(int(np.floor(max(ay, by, cy))), h - 1)
-        ia, ib, ic = 1.0 / z[a], 1.0 / z[b], 1.0 / z[c]
+        if x_a > x_b or y_a > y_b:
+            continue
+        # Barycentric weights of a, b and c change by these from pixel to pixel, and 1/z by the last.
+        slope_u, slope_v = (by - cy) / area, (cy - ay) / area
+        slope_s = -slope_u - slope_v
+        rise_a, rise_b = inverse[a] - inverse[c], inverse[b] - inverse[c]
+        slope = slope_u * rise_a + slope_v * rise_b
         for y in range(y_a, y_b + 1):
-            for x in range(x_a, x_b + 1):
-                u = ((bx - x) * (cy - y) - (by - y) * (cx - x)) / area
-                v = ((cx - x) * (ay - y) - (cy - y) * (ax - x)) / area
-                s = 1.0 - u - v
-                if u >= -1e-9 and v >= -1e-9 and s >= -1e-9:
-                    d = 1.0 / (u * ia + v * ib + s * ic)
-                    if depth[y, x] == 0.0 or d < depth[y, x]:
-                        depth[y, x] = d
+            u = ((bx - x_a) * (cy - y) - (by - y) * (cx - x_a)) / area
+            v = ((cx - x_a) * (ay - y) - (cy - y) * (ax - x_a)) / area
+            first, last = 0.0, float(x_b - x_a)
+            for weight, change in ((u, slope_u), (v, slope_v), (1.0 - u - v, slope_s)):
+                if change > 0.0:
+                    first = max(first, (-1e-9 - weight) / change)
+                elif change < 0.0:
+                    last = min(last, (-1e-9 - weight) / change)
+                elif weight < -1e-9:
+                    last = -1.0
+            d = inverse[c] + u * rise_a + v * rise_b
+            for i in range(int(np.ceil(first)), int(np.floor(last)) + 1):
+                depth[y, x_a + i] = max(depth[y, x_a + i], d + i * slope)
+    for y in range(h):
+        for x in range(w):
+            if depth[y, x] > 0.0:
+                depth[y, x] = 1.0 / depth[y, x]

@@ -17,6 +17,7 @@ from .geometry import Array, Symmetry
 from .vessel_shapes import (
     SEGMENTS,
     Lip,
+    Shape,
     Solid,
     cumulative_share,
     eroded,
@@ -75,9 +76,9 @@ class Walls:
 
 @dataclass(frozen=True)
 class Part:
-    """A solid with its colour; density_kg_m3 None means the vessel's own material."""
+    """A shape with its colour; density_kg_m3 None means the vessel's own material."""
 
-    solid: Solid
+    shape: Shape
     rgba: Color
     density_kg_m3: float | None = None
 
@@ -306,7 +307,7 @@ def assemble(category: str, params: Mapping[str, float], draft: Draft) -> Vessel
     colors: dict[int, Color] = {}
 
     def tagged(part: Part) -> Solid:
-        solid = part.solid.as_original()
+        solid = part.shape.solid.as_original()
         colors[solid.original_id()] = part.rgba
         return solid
 
@@ -319,7 +320,7 @@ def assemble(category: str, params: Mapping[str, float], draft: Draft) -> Vessel
     mass_kg = draft.density_kg_m3 * final.volume()
     for part in draft.additions:
         if part.density_kg_m3 is not None:
-            mass_kg += (part.density_kg_m3 - draft.density_kg_m3) * part.solid.volume()
+            mass_kg += (part.density_kg_m3 - draft.density_kg_m3) * part.shape.solid.volume()
 
     raw = final.to_mesh64()
     vertices = np.asarray(raw.vert_properties[:, :3], np.float64)
@@ -367,14 +368,11 @@ def outline_surfaces(draft: Draft) -> tuple[Array, NDArray[np.int32]]:
     """
     walls = draft.walls
     shell = lofted(walls.outer, walls.corner_outer, walls.aspect, walls.lip, walls.height_m, walls.sides)
-    vertices, faces, count = [], [], 0
-    for solid in (shell, *(part.solid for part in draft.additions)):
-        raw = solid.to_mesh64()
-        vertices.append(np.asarray(raw.vert_properties[:, :3], np.float64))
-        faces.append(np.asarray(raw.tri_verts, np.int32) + count)
-        count += len(vertices[-1])
-    points = np.concatenate(vertices)
-    return points - 0.5 * (points.min(axis=0) + points.max(axis=0)), np.concatenate(faces)
+    surfaces = [surface for shape in (shell, *(part.shape for part in draft.additions)) for surface in shape.surfaces]
+    first = np.cumsum([0, *(len(vertices) for vertices, _ in surfaces[:-1])])
+    points = np.concatenate([vertices for vertices, _ in surfaces])
+    faces = np.concatenate([faces + np.int32(start) for start, (_, faces) in zip(first, surfaces, strict=True)])
+    return points - 0.5 * (points.min(axis=0) + points.max(axis=0)), faces
 
 
 def _profile(points: Array, corner: Array | None, aspect: float) -> Profile:

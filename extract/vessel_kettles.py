@@ -271,7 +271,7 @@ def electric_kettle(p: Params, rgba: Color) -> Draft:
         walls, [(0.0, z_top), (0.97 * x_out, z_top), (x_out, z_low), (0.0, z_low)], 0.62 * thick, thick, BLACK, 0.03
     )
     dark = [
-        Part(part, BLACK, PLASTIC_KG_M3) for part in (stand - hollow, handle.solid, lofted(smooth_profile(lid, 10)))
+        Part(part, BLACK, PLASTIC_KG_M3) for part in (stand - hollow, handle.shape, lofted(smooth_profile(lid, 10)))
     ]
     return Draft(
         walls,

@@ -1,18 +1,20 @@
-"""Solids that vessels are put together from: lofted walls, bent tubes, domes; and the planar curves they follow.
+"""Shapes that vessels are put together from: lofted walls, bent tubes, domes; and the planar curves they follow.
 
-Solids are `manifold3d.Manifold`, so that unions and differences stay watertight. Curves in the symmetry plane are
-(K, 2) points (x, z); profiles of walls are (K, 2) points (z, r) with ascending z.
+Shapes become `manifold3d.Manifold`, so that unions and differences stay watertight, when they are asked for. Curves
+in the symmetry plane are (K, 2) points (x, z); profiles of walls are (K, 2) points (z, r) with ascending z.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
 from typing import TypeAlias
 
 import manifold3d
 import numpy as np
+from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
 from .geometry import Array
@@ -23,6 +25,28 @@ Solid: TypeAlias = manifold3d.Manifold  # noqa: UP040
 
 SEGMENTS = 64
 TUBE_SEGMENTS = 24
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A closed solid, made watertight by booleans only when `solid` is asked for: outlines do without.
+
+    surfaces: vertices (V, 3) in m and faces (F, 3) of closed surfaces that together have its silhouette.
+    """
+
+    surfaces: tuple[tuple[Array, NDArray[np.int32]], ...]
+    make: Callable[[], Solid] = field(repr=False)
+
+    @cached_property
+    def solid(self) -> Solid:
+        return self.make()
+
+    def __add__(self, other: Shape) -> Shape:
+        return Shape(self.surfaces + other.surfaces, lambda: self.solid + other.solid)
+
+    def __sub__(self, other: Shape) -> Shape:
+        """Less a hole that does not show from outside."""
+        return Shape(self.surfaces, lambda: self.solid - other.solid)
 
 
 @dataclass(frozen=True)
@@ -75,12 +99,12 @@ def rounded_path(points: Array, fillet_m: float | Sequence[float], steps: int = 
         center = corner + (u + v) / np.linalg.norm(u + v) * (radius / sin_half)
         start, end = corner + u * tangent - center, corner + v * tangent - center
         sweep = math.acos(float(np.clip(start @ end / radius**2, -1, 1)))
-        for t in np.linspace(0, 1, steps + 1):
-            path.append(center + (math.sin((1 - t) * sweep) * start + math.sin(t * sweep) * end) / math.sin(sweep))
+        t = np.linspace(0, 1, steps + 1)[:, None]
+        path.extend(center + (np.sin((1 - t) * sweep) * start + np.sin(t * sweep) * end) / math.sin(sweep))
     path.append(points[-1])
     kept = [path[0]]
     for point in path[1:]:
-        if np.linalg.norm(point - kept[-1]) > 1e-7:
+        if math.dist(point, kept[-1]) > 1e-7:
             kept.append(point)
     return np.asarray(kept)
 
@@ -127,9 +151,13 @@ def eroded(outer: Array, wall_m: float, floor_z_m: float, top_z_m: float) -> Arr
     """
     fine = resampled(outer, max(wall_m / 3, float(np.ptp(outer[:, 0])) / 1200))
     z = np.unique(np.concatenate([[floor_z_m, top_z_m], fine[(fine[:, 0] > floor_z_m) & (fine[:, 0] < top_z_m), 0]]))
-    gap = np.abs(z[:, None] - fine[None, :, 0])
+    # Only samples within the disc of each height are looked at, as many for every height.
+    first = np.searchsorted(fine[:, 0], z - wall_m)
+    most = int((np.searchsorted(fine[:, 0], z + wall_m, side="right") - first).max()) + 1
+    near = fine[np.minimum(first[:, None] - 1 + np.arange(most + 1), len(fine) - 1).clip(0)]
+    gap = np.abs(z[:, None] - near[..., 0])
     with np.errstate(invalid="ignore"):
-        reach = fine[None, :, 1] - np.sqrt(np.where(gap <= wall_m, wall_m**2 - gap**2, np.nan))
+        reach = near[..., 1] - np.sqrt(np.where(gap <= wall_m, wall_m**2 - gap**2, np.nan))
     # Exactly at each z the wall is as thick as the disc even where the samples miss it.
     r = np.fmin(np.nanmin(reach, axis=1), np.interp(z, outer[:, 0], outer[:, 1]) - wall_m)
     return np.column_stack([z, r])
@@ -156,7 +184,7 @@ def round_off(profile: Array, bottom_m: float, top_m: float, *, top_outward: boo
     return np.column_stack([fine, radius])
 
 
-def _solid(vertices: Array, faces: np.ndarray[tuple[int, ...], np.dtype[np.int64]]) -> Solid:
+def _solid(vertices: Array, faces: NDArray[np.int32]) -> Solid:
     mesh = manifold3d.Mesh64(
         vert_properties=np.ascontiguousarray(vertices, np.float64),
         tri_verts=np.ascontiguousarray(faces, np.uint64),
@@ -167,21 +195,29 @@ def _solid(vertices: Array, faces: np.ndarray[tuple[int, ...], np.dtype[np.int64
     return solid
 
 
-def stacked_rings(rings: Array) -> Solid:
-    """Solid between K stacked polygons (K, n, 3), each counter-clockwise seen from ahead, with flat end caps."""
-    levels, n = rings.shape[:2]
+def stacked_rings(rings: Array) -> Shape:
+    """Shape between K stacked polygons (K, n, 3), each counter-clockwise seen from ahead, with flat end caps."""
     vertices = np.concatenate([rings.reshape(-1, 3), rings[0].mean(0)[None], rings[-1].mean(0)[None]])
+    faces = _stacked_faces(*rings.shape[:2])
+    return Shape(((vertices, faces),), lambda: _solid(vertices, faces))
+
+
+@lru_cache(maxsize=256)
+def _stacked_faces(levels: int, n: int) -> NDArray[np.int32]:
+    """(F, 3) faces between stacked rings of n vertices, whose caps have their middles after them."""
     ring = np.arange(n)
     following = np.roll(ring, -1)
-    faces = []
-    for level in range(levels - 1):
-        a, b = level * n, (level + 1) * n
-        faces.append(np.column_stack([a + ring, a + following, b + following]))
-        faces.append(np.column_stack([a + ring, b + following, b + ring]))
+    a = n * np.arange(levels - 1)[:, None]
+    b = a + n
+    lower = np.stack([a + ring, a + following, b + following], axis=-1)
+    upper = np.stack([a + ring, b + following, b + ring], axis=-1)
+    sides = np.concatenate([lower, upper], axis=1).reshape(-1, 3)
     top = (levels - 1) * n
-    faces.append(np.column_stack([np.full(n, levels * n), following, ring]))
-    faces.append(np.column_stack([np.full(n, levels * n + 1), top + ring, top + following]))
-    return _solid(vertices, np.concatenate(faces))
+    low_cap = np.column_stack([np.full(n, levels * n), following, ring])
+    high_cap = np.column_stack([np.full(n, levels * n + 1), top + ring, top + following])
+    faces: NDArray[np.int32] = np.concatenate([sides, low_cap, high_cap]).astype(np.int32)
+    faces.setflags(write=False)  # shared
+    return faces
 
 
 def lofted(
@@ -191,8 +227,8 @@ def lofted(
     lip: Lip | None = None,
     rim_m: float = 0.0,
     sides: int = 0,
-) -> Solid:
-    """Solid whose horizontal cross-sections follow profile (z, r), closed by flat discs below and above.
+) -> Shape:
+    """Shape whose horizontal cross-sections follow profile (z, r), closed by flat discs below and above.
 
     sides: 0 for the cross-section of corner and aspect, else a regular polygon around the circle of radius r.
     """
@@ -212,7 +248,7 @@ def lofted(
     return stacked_rings(np.concatenate([xy, np.broadcast_to(z[:, None, None], (*xy.shape[:2], 1))], axis=-1))
 
 
-def tube(path: Array, half_m: Array | float, half_y_m: Array | float | None = None, *, dome: float = 0.0) -> Solid:
+def tube(path: Array, half_m: Array | float, half_y_m: Array | float | None = None, *, dome: float = 0.0) -> Shape:
     """Tube along a path (K, 2) of (x, z) in the symmetry plane, of elliptic cross-section.
 
     half_m: half thickness within the plane, one value or (K,); half_y_m: across it, equal to half_m if None.

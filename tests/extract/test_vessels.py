@@ -97,7 +97,7 @@ def test_nothing_enters_the_interior(category, seed):
     inner = vessel.interior
     z = np.unique(np.clip(inner.z_m, inner.z_m[0] + 2e-4, inner.z_m[-1] - vessel.wall_m - 1e-3))
     radius, corner = np.interp(z, inner.z_m, inner.radius_m), np.interp(z, inner.z_m, inner.corner)
-    content = stacked_rings(Profile(z, radius - 3e-4, corner, inner.aspect, inner.axis_xy_m).outlines())
+    content = stacked_rings(Profile(z, radius - 3e-4, corner, inner.aspect, inner.axis_xy_m).outlines()).solid
     overlap = (content ^ as_solid(vessel.mesh)).volume()
     assert overlap < 1e-9
 
@@ -318,7 +318,7 @@ def test_profile_volume_is_that_of_the_rounded_prism(radius, height, aspect, cor
     area = 4 * radius * radius * aspect - (4 - np.pi) * (corner * radius * aspect) ** 2
     assert profile.volume_m3 == pytest.approx(area * height)
     assert profile.volume_below_m3(0.25 * height) == pytest.approx(0.25 * area * height)
-    polygon = stacked_rings(profile.outlines(256)).volume()
+    polygon = stacked_rings(profile.outlines(256)).solid.volume()
     assert polygon == pytest.approx(profile.volume_m3, rel=2e-3)
 
 
