@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 
 from .geometry import Array, project, transform_points
 
+FAR_M = np.float32(1e30)  # of pixels where nothing was drawn yet
+
 
 @dataclass(frozen=True)
 class DepthWindow:
@@ -68,18 +70,16 @@ def render_depth(
     size = np.ceil(pixels.max(axis=0)).astype(int) + margin_px + 1 - low
     if size.max() > max_side_px:
         return None
-    depth = np.zeros((size[1], size[0]), np.float32)
+    depth = np.empty((size[1], size[0]), np.float32)
     _fill(pixels - low, points[:, 2], faces, depth)
     return DepthWindow(depth, int(low[0]), int(low[1]))
 
 
 @numba.njit(cache=True, fastmath=True)
 def _fill(uv: Array, z: Array, faces: NDArray[np.int32], depth: NDArray[np.float32]) -> None:
-    """Z-buffer with 1/z interpolated linearly on the image plane, which is exact for planes in perspective.
-
-    `depth` (h, w), zeros at first, holds 1/z until the end; the largest wins.
-    """
+    """Z-buffer with 1/z interpolated linearly on the image plane, which is exact for planes in perspective."""
     h, w = depth.shape
+    depth[:] = FAR_M
     inverse = 1.0 / z
     for f in range(faces.shape[0]):
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
@@ -111,8 +111,8 @@ def _fill(uv: Array, z: Array, faces: NDArray[np.int32], depth: NDArray[np.float
                     last = -1.0
             d = inverse[c] + u * rise_a + v * rise_b
             for i in range(int(np.ceil(first)), int(np.floor(last)) + 1):
-                depth[y, x_a + i] = max(depth[y, x_a + i], d + i * slope)
+                depth[y, x_a + i] = min(depth[y, x_a + i], np.float32(1.0 / (d + i * slope)))
     for y in range(h):
         for x in range(w):
-            if depth[y, x] > 0.0:
-                depth[y, x] = 1.0 / depth[y, x]
+            if depth[y, x] == FAR_M:
+                depth[y, x] = 0.0
