@@ -293,10 +293,19 @@ def body_grasp(walls: Walls, low: float, high: float, *, sideways: bool = False)
     )
 
 
-def assemble(category: str, params: Mapping[str, float], draft: Draft) -> Vessel:
-    """Join the parts, hollow them out and move the origin to the centre of the bounding box."""
-    import trimesh
+@dataclass(frozen=True)
+class Joined:
+    """A draft's parts as one watertight surface: vertices (V, 3) in m, faces (F, 3), and each face's part, (F,) in the
+    order of `_parts`."""
 
+    vertices: Array
+    faces: NDArray[np.int64]
+    part: NDArray[np.int64]
+    mass_kg: float
+
+
+def _parts(draft: Draft) -> tuple[list[Part], list[Part], list[Part]]:
+    """The bare body with its dents, what is joined to it, and what is taken away from all of that."""
     walls = draft.walls
     shell = lofted(walls.outer, walls.corner_outer, walls.aspect, walls.lip, walls.height_m, walls.sides)
     cavity_profile, cavity_corner = walls.inner, walls.corner_inner
@@ -304,33 +313,43 @@ def assemble(category: str, params: Mapping[str, float], draft: Draft) -> Vessel
         cavity_profile = np.vstack([walls.inner, [walls.inner[-1, 0] + OVERCUT_M, walls.inner[-1, 1]]])
         cavity_corner = None if cavity_corner is None else np.append(cavity_corner, cavity_corner[-1])
     cavity = lofted(cavity_profile, cavity_corner, walls.aspect, walls.lip, walls.height_m)
-    colors: dict[int, Color] = {}
+    body = [Part(shell, draft.rgba), *draft.dents]
+    return body, draft.additions, [Part(cavity, draft.inside_rgba or draft.rgba), *draft.cuts]
+
+
+def joined(draft: Draft) -> Joined:
+    """Join the parts and hollow them out: the slow half of making a vessel, which its colour has no say in."""
+    numbers: dict[int, int] = {}
 
     def tagged(part: Part) -> Solid:
         solid = part.shape.solid.as_original()
-        colors[solid.original_id()] = part.rgba
+        numbers[solid.original_id()] = len(numbers)
         return solid
 
-    body = Solid.batch_boolean(
-        [tagged(part) for part in [Part(shell, draft.rgba), *draft.dents]], manifold3d.OpType.Subtract
+    body, additions, hollow = ([tagged(part) for part in parts] for parts in _parts(draft))
+    whole = Solid.batch_boolean(
+        [Solid.batch_boolean(body, manifold3d.OpType.Subtract), *additions], manifold3d.OpType.Add
     )
-    joined = Solid.batch_boolean([body, *map(tagged, draft.additions)], manifold3d.OpType.Add)
-    hollow = [tagged(part) for part in [Part(cavity, draft.inside_rgba or draft.rgba), *draft.cuts]]
-    final = Solid.batch_boolean([joined, *hollow], manifold3d.OpType.Subtract)
+    final = Solid.batch_boolean([whole, *hollow], manifold3d.OpType.Subtract)
     mass_kg = draft.density_kg_m3 * final.volume()
     for part in draft.additions:
         if part.density_kg_m3 is not None:
             mass_kg += (part.density_kg_m3 - draft.density_kg_m3) * part.shape.solid.volume()
-
     raw = final.to_mesh64()
-    vertices = np.asarray(raw.vert_properties[:, :3], np.float64)
-    faces = np.asarray(raw.tri_verts, np.int64)
-    face_rgba = np.empty((len(faces), 4), np.uint8)
-    starts = np.asarray(raw.run_index, np.int64) // 3
-    for original, start, end in zip(raw.run_original_id, starts[:-1], starts[1:], strict=True):
-        face_rgba[start:end] = np.round(255 * np.asarray(colors[int(original)]))
+    runs = np.diff(np.asarray(raw.run_index, np.int64) // 3)
+    part_of_face = np.repeat([numbers[int(original)] for original in raw.run_original_id], runs)
+    vertices, faces = np.asarray(raw.vert_properties[:, :3], np.float64), np.asarray(raw.tri_verts, np.int64)
+    return Joined(vertices, faces, part_of_face, float(mass_kg))
+
+
+def assemble(category: str, params: Mapping[str, float], draft: Draft, whole: Joined) -> Vessel:
+    """Colour the draft's joined parts and move the origin to the centre of the bounding box."""
+    import trimesh
+
+    walls, vertices = draft.walls, whole.vertices
+    face_rgba = np.round(255 * np.array([part.rgba for parts in _parts(draft) for part in parts])).astype(np.uint8)
     offset = -0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
-    mesh = trimesh.Trimesh(vertices + offset, faces, process=False, face_colors=face_rgba)
+    mesh = trimesh.Trimesh(vertices + offset, whole.faces, process=False, face_colors=face_rgba[whole.part])
 
     interior = _profile(walls.inner, walls.corner_inner, walls.aspect).shifted(offset)
     exterior = _profile(walls.outer, walls.corner_outer, walls.aspect).shifted(offset)
@@ -354,7 +373,7 @@ def assemble(category: str, params: Mapping[str, float], draft: Draft) -> Vessel
         is_open=walls.is_open,
         grasps=tuple(replace(grasp, center_m=grasp.center_m + offset) for grasp in draft.grasps),
         interior_volume_m3=volume,
-        mass_kg=float(mass_kg),
+        mass_kg=whole.mass_kg,
         color_rgba=draft.rgba,
         extents_m=(extent_x, extent_y, extent_z),
     )

@@ -17,7 +17,7 @@ from . import vessel_pitchers as pitchers
 from . import vessel_pots as pots
 from .errors import UserError
 from .geometry import Array
-from .vessel_assembly import STEEL, Draft, assemble, outline_surfaces
+from .vessel_assembly import STEEL, Draft, Joined, assemble, joined, outline_surfaces
 from .vessel_types import Color, GraspRegion, Outlet, Profile, Range, Section, Vessel
 
 __all__ = [
@@ -124,8 +124,7 @@ def outline_mesh(category: str, params: Mapping[str, float]) -> tuple[Array, NDA
 
     params: the full set, within the limits. Not watertight, and much faster.
     """
-    rgba = (params["red"], params["green"], params["blue"], 1.0)
-    return outline_surfaces(_entry(category).draft(params, rgba))
+    return outline_surfaces(_draft(category, params))
 
 
 def resolve_category(word: str) -> tuple[str, ...]:
@@ -170,5 +169,14 @@ def _variant(category: str, seed: int) -> dict[str, float]:
 @lru_cache(maxsize=64)
 def _build(category: str, items: tuple[tuple[str, float], ...]) -> Vessel:
     values = dict(items)
-    rgba = (values["red"], values["green"], values["blue"], 1.0)
-    return assemble(category, values, _entry(category).draft(values, rgba))
+    shape = tuple((name, value) for name, value in items if name not in _COLOR_RANGES)
+    return assemble(category, values, _draft(category, values), _joined(category, shape))
+
+
+@lru_cache(maxsize=64)
+def _joined(category: str, shape: tuple[tuple[str, float], ...]) -> Joined:
+    return joined(_draft(category, {**dict(shape), **dict.fromkeys(_COLOR_RANGES, 0.5)}))
+
+
+def _draft(category: str, values: Mapping[str, float]) -> Draft:
+    return _entry(category).draft(values, (values["red"], values["green"], values["blue"], 1.0))
