@@ -10,9 +10,11 @@ from ..envs.grasps import MAX_WIDTH_M
 from ..envs.kinematics import limit_margin_rad, manipulability, panda_chain
 from ..envs.panda import DQ_MAX_RAD_S, PAYLOAD_MAX_KG, TAU_MAX_NM
 from ..extract.geometry import Array
+from .collisions import collisions_of, told
 from .export import commands_of
 from .limits import LIMITS, Extreme, commanded, extremes
 from .retarget import Solver, retarget, tracking_errors
+from .variants import nearest_variant
 
 if TYPE_CHECKING:
     from ..envs.reference import Reference
@@ -23,7 +25,6 @@ _TIGHT_RAD = 0.05
 _SHOULDER = np.array([0.0, 0.0, 0.333])
 # While the tilt is above this part of its greatest value it is the pour.
 _POURING_PART = 0.5
-_SLOWER = (1.0, 1.4, 2.0)
 
 
 def feasibility(reference: Reference, joints: JointTrajectory) -> dict[str, Any]:
@@ -32,7 +33,8 @@ def feasibility(reference: Reference, joints: JointTrajectory) -> dict[str, Any]
     `feasible`: tracking within 1 cm and 5 degrees, all limits of joints, gripper and payload kept, no collision.
     `limits`: where the motion comes nearest to each limit at 1 kHz, and the margin that is left of it. `phases`: errors
     before, in and after the pour. `changed`: from the video, in numbers. `variant`: for what is not feasible, the
-    nearest motion found that is, and how far that is away; None if there is none. `scale_search`: what `--scale auto`
+    nearest motion found that is, and how far that is away; None if there is none. `collisions`: of arm, vessel, table
+    and receptacle, at every knot. `scale_search`: what `--scale auto`
     tried and what came of it. `words`: all of it in plain sentences. Raises ValueError when the two differ in length.
     """
     findings, problems = _findings(reference, joints)
@@ -53,8 +55,8 @@ def _findings(reference: Reference, joints: JointTrajectory) -> tuple[dict[str, 
     speed_part = np.abs(joints.dq_rad_s) / DQ_MAX_RAD_S
     torque_part = np.abs(joints.tau_nm) / TAU_MAX_NM
     hand = panda_chain().hand(joints.q_rad)[:, :3, 3]
-    told = commands_of(joints)
-    found = extremes(commanded(told.q_rad, told.tau_nm))
+    commands = commands_of(joints)
+    found = extremes(commanded(commands.q_rad, commands.tau_nm))
     nearest = {name: max((e for e in found if e.quantity == name), key=lambda e: e.part) for name in LIMITS}
     grasp = reference.header.get("grasp", {})
     findings: dict[str, Any] = {
@@ -68,7 +70,7 @@ def _findings(reference: Reference, joints: JointTrajectory) -> tuple[dict[str, 
         "reach_m": float(np.linalg.norm(hand - _SHOULDER, axis=1).max()),
         "manipulability": float(manipulability(joints.q_rad).min()),
         "lowest_hand_m": float(hand[:, 2].min()),
-        "collisions": list(reference.header.get("feasibility", {}).get("collisions", [])),
+        "collisions": [told(reference, collision) for collision in collisions_of(reference, joints.q_rad)],
         "scale": reference.scale,
         "time_stretch": float(reference.header.get("time_stretch", 1.0)),
         "solver": joints.header.get("solver", {}).get("name", "mink"),
@@ -119,7 +121,8 @@ def _problems(findings: dict[str, Any], margin: Array, speed_part: Array, torque
             f"{100 * MAX_WIDTH_M:.1f} cm"
         )
     problems += [
-        f"the {c['first']} touches the {c['second']} around {c['video_time_s']:.1f} s of the video"
+        f"the {c['first']} touches the {c['second']} at {c['time_s']:.1f} s, around {c['video_time_s']:.1f} s of the "
+        f"video, {1000 * c['depth_m']:.0f} mm deep"
         for c in findings["collisions"]
     ]
     return problems
@@ -172,24 +175,17 @@ def _limit(extreme: Extreme) -> dict[str, Any]:
 
 
 def _variant(reference: Reference, joints: JointTrajectory, findings: dict[str, Any]) -> dict[str, Any] | None:
-    """The nearest feasible motion, where going slower is what helps; else None."""
+    """The nearest motion found that is feasible; see `nearest_variant`."""
     parts = {name: entry["part"] for name, entry in findings["limits"].items()}
     speed = max(max(entry["value"] for entry in findings["speed_part_of_limit"]), parts["speed"])
-    needed = max(speed, parts["acceleration"] ** 0.5, parts["jerk"] ** (1 / 3), 1.05)
+    slower = max(speed, parts["acceleration"] ** 0.5, parts["jerk"] ** (1 / 3), 1.05)
     solver: Solver = "torque" if findings["solver"] == "crocoddyl" else "mink"
-    contents_kg = joints.header.get("contents_kg")
-    for more in _SLOWER:
-        factor = 1.03 * needed * more
-        slow = reference.stretched(factor)
-        _, problems = _findings(slow, retarget(slow, contents_kg=contents_kg, strict=False, solver=solver))
-        if not problems:
-            return {
-                "time_stretch": factor,
-                "extra_s": slow.duration_s - reference.duration_s,
-                "words": f"Played {factor:.2f} times slower (--speed {1.0 / factor:.2f}), {slow.duration_s:.1f} s in "
-                f"place of {reference.duration_s:.1f} s, it can.",
-            }
-    return None
+
+    def works(changed: Reference, contents_kg: float | None) -> bool:
+        made = retarget(changed, contents_kg=contents_kg, strict=False, solver=solver)
+        return not _findings(changed, made)[1]
+
+    return nearest_variant(reference, joints.header.get("contents_kg"), findings["payload_kg"], slower, works)
 
 
 def _words(findings: dict[str, Any], problems: list[str], variant: list[str]) -> list[str]:

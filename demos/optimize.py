@@ -4,7 +4,8 @@
 
 solved by Crocoddyl's feasibility-driven dynamic programming on Pinocchio's rigid-body dynamics of the arm, the vessel
 and its contents. Unlike inverse kinematics it sees the whole motion at once: it begins early what it could not do in
-time, and what the tracker trembles costs it torque.
+time, and what the tracker trembles costs it torque. How much a frame pulls, w_d, follows from how far it may be off:
+by what the track trembles, which the track itself shows, and by what the tracker was unsure of the frame.
 
 Limits of position, speed, acceleration and torque are soft barriers here. Jerk is no quantity of this problem: the
 weights on torque and acceleration keep it at a few percent of its limit. Whoever uses the motion checks all of them
@@ -13,7 +14,7 @@ weights on torque and acceleration keep it at a few percent of its limit. Whoeve
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -39,16 +40,19 @@ if TYPE_CHECKING:
 
 # What the hand weighs does not hang on where its fingers are; about where they hold a handle.
 _FINGERS_M = 0.01
-# Frames that the tracker was not sure of at all still pull a little, or nothing would hold the motion there.
-MIN_CONFIDENCE = 0.05
 _N = 7
+# Standard deviation of the fourth differences of numbers that scatter by 1, and what turns a median into it.
+_FOURTH, _NORMAL = np.sqrt(70.0), 1.4826
 
 
 @dataclass(frozen=True)
 class TorqueWeights:
     """Weights of the cost, per second of motion. The paper gives none; `bench/retarget.py` shows what each trades.
 
-    position_1_m2, rotation_1_rad2: w_d for the two halves of the logarithm; a radian counts as 0.2 m.
+    position_1_m2, rotation_1_rad2: w_d for the two halves of the logarithm where the track is exact and sure; a radian
+        counts as 0.2 m.
+    patience, unsure_m, unsure_rad: a frame that may be off by s pulls with 1 / (1 / w_d + patience s^2). s^2 is the
+        square of the track's tremble plus that of `unsure_*` times what the frame's confidence lacks of 1.
     speed: w_dq in s^2/rad^2. torque: w_tau in 1/(N m)^2. acceleration: in s^4/rad^2, beyond the paper: torque alone
         lets the light wrist tremble, because that costs next to none. posture: in 1/rad^2, draws the redundancy to the
         warm start, whose collisions were looked at.
@@ -57,19 +61,32 @@ class TorqueWeights:
     barrier: on what goes beyond `*_part` of the joints' limits, in the limits' own units.
     """
 
-    position_1_m2: float = 6e4
-    rotation_1_rad2: float = 2.4e3
+    position_1_m2: float = 2e6
+    rotation_1_rad2: float = 8e4
+    patience: float = 50.0
+    unsure_m: float = 2e-3
+    unsure_rad: float = 1e-2
     speed: float = 1e-2
     torque: float = 1e-3
     acceleration: float = 1e-3
-    posture: float = 0.1
-    end_ease: float = 10.0
+    posture: float = 1.0
+    end_ease: float = 100.0
     barrier: float = 1e3
     position_margin_rad: float = 0.015
     speed_part: float = 0.95
     acceleration_part: float = 0.9
     torque_part: float = 0.95
     iterations: int = 30
+
+    def softened(self) -> TorqueWeights:
+        """For a track that asks for more than the limits allow: it is followed less closely and ends less gently."""
+        return replace(
+            self,
+            position_1_m2=self.position_1_m2 / 30.0,
+            rotation_1_rad2=self.rotation_1_rad2 / 30.0,
+            posture=self.posture / 10.0,
+            end_ease=self.end_ease / 10.0,
+        )
 
 
 @dataclass(frozen=True)
@@ -128,7 +145,7 @@ def optimize(
 ) -> Optimized:
     """The motion of least cost that begins, at rest, where the warm start (N, 7) does.
 
-    Frames weigh as the reference is confident of them. The turn about an axis of continuous symmetry, which nobody
+    Frames pull as `pull_of` says. The turn about an axis of continuous symmetry, which nobody
     sees, is left to the optimizer. Limits are barriers here; whoever uses the motion must check them. Raises UserError
     when the extra `torque` is not installed.
     """
@@ -155,6 +172,34 @@ def optimize(
     return Optimized(q_rad, np.array(solver.us), float(solver.cost), int(solver.iter), bool(converged))
 
 
+def tremble_of(reference: Reference) -> tuple[float, float]:
+    """By how much the poses scatter about a smooth motion, from knot to knot and along each axis: m and rad.
+
+    Fourth differences of what a hand does are next to nothing, those of white noise are large. Their median tells it
+    without being misled by a few hasty moments.
+    """
+    T = reference.T_world_object
+    turn_rad = Rotation.from_matrix(T[1:, :3, :3] @ np.swapaxes(T[:-1, :3, :3], 1, 2)).as_rotvec()
+    bends = np.diff(T[:, :3, 3], n=4, axis=0), np.diff(turn_rad, n=3, axis=0)
+    m, rad = (_NORMAL / _FOURTH * float(np.median(np.abs(bend))) if len(bend) else 0.0 for bend in bends)
+    return m, rad
+
+
+def pull_of(reference: Reference, weights: TorqueWeights) -> Array:
+    """(N, 2) w_d of each knot for position in 1/m^2 and rotation in 1/rad^2."""
+    lacking = 1.0 - np.clip(reference.confidence, 0.0, 1.0)
+    columns = []
+    for most, tremble, unsure in zip(
+        (weights.position_1_m2, weights.rotation_1_rad2),
+        tremble_of(reference),
+        (weights.unsure_m, weights.unsure_rad),
+        strict=True,
+    ):
+        variance = tremble**2 + (unsure * lacking) ** 2
+        columns.append(1.0 / (1.0 / most + weights.patience * variance))
+    return np.column_stack(columns)
+
+
 class _Problem:
     """The cost models of all knots; what does not change from knot to knot is shared among them."""
 
@@ -165,11 +210,9 @@ class _Problem:
         self._state = crocoddyl.StateMultibody(model)
         self._actuation = crocoddyl.ActuationModelFull(self._state)
         self._step_s, self._last = 1.0 / reference.control_hz, len(reference) - 1
-        self._confidence = np.maximum(reference.confidence, MIN_CONFIDENCE)
-        pose = np.concatenate([np.full(3, weights.position_1_m2), np.full(3, weights.rotation_1_rad2)])
+        self._pull = np.repeat(pull_of(reference, weights), 3, axis=1)
         if reference.symmetry.order == 0:
-            pose[5] = 0.0
-        self._pose = crocoddyl.ActivationModelWeightedQuad(pose)
+            self._pull[:, 5] = 0.0
         self._posture = crocoddyl.ActivationModelWeightedQuad(
             np.concatenate([np.full(_N, weights.posture), np.full(_N, weights.speed)])
         )
@@ -184,7 +227,7 @@ class _Problem:
         ease = 1.0 + weights.end_ease * max(0.0, 1.0 - to_end_s / 0.25) ** 2
         pose = c.ResidualModelFramePlacement(self._state, self._frame, self._targets[knot], _N)
         still = c.ResidualModelState(self._state, np.concatenate([q_warm_rad, np.zeros(_N)]), _N)
-        costs.addCost("pose", self._cost(pose, self._pose), float(self._confidence[knot]))
+        costs.addCost("pose", self._cost(pose, c.ActivationModelWeightedQuad(self._pull[knot])), 1.0)
         costs.addCost("posture", self._cost(still, self._posture), ease)
         state_barrier, *control_barriers = self._barriers
         costs.addCost("state limits", state_barrier, weights.barrier * 100.0)

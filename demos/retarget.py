@@ -99,27 +99,35 @@ def _improved(
     reference: Reference, q_warm_rad: Array, payload: Any, weights: optimize.TorqueWeights
 ) -> tuple[Array, dict[str, Any]]:
     """The motion of least cost near a warm start (N, 7), or the warm start where that is the better one."""
-    solved = optimize.optimize(reference, q_warm_rad, payload, weights)
-    told: dict[str, Any] = {
-        "name": "crocoddyl",
-        "iterations": solved.iterations,
-        "converged": solved.converged,
-        "weights": asdict(weights),
-    }
-    before, after = (_faults(reference, q) for q in (q_warm_rad, solved.q_rad))
-    if after <= before:
-        return solved.q_rad, told
-    told |= {"name": "mink", "note": "The optimizer found no motion as good as inverse kinematics, which was kept."}
-    return q_warm_rad, told
+    best = q_warm_rad
+    told: dict[str, Any] = {"name": "mink"}
+    least = _faults(reference, q_warm_rad)
+    # What is followed closely through its limits breaks them between the knots.
+    for tried in (weights, weights.softened()):
+        solved = optimize.optimize(reference, q_warm_rad, payload, tried)
+        faults = _faults(reference, solved.q_rad)
+        if faults < least or (faults == least and told["name"] == "mink"):
+            best, least = solved.q_rad, faults
+            told = {
+                "name": "crocoddyl",
+                "iterations": solved.iterations,
+                "converged": solved.converged,
+                "weights": asdict(tried),
+            }
+        if not any(faults):
+            break
+    if told["name"] == "mink":
+        told["note"] = "The optimizer found no motion as good as inverse kinematics, which was kept."
+    return best, told
 
 
-def _faults(reference: Reference, q_rad: Array) -> tuple[bool, int]:
-    """What makes a motion worse than another, most important first: the object is lost, limits are broken."""
+def _faults(reference: Reference, q_rad: Array) -> tuple[bool, float]:
+    """What makes a motion worse than another: the object is lost; by how much joints go beyond their limits."""
     position_m, rotation_rad = tracking_errors(reference, q_rad)
     lost = bool((position_m > LOST_M).any() or (rotation_rad > LOST_RAD).any())
     curve = JointCurve(reference.time_s - reference.time_s[0], q_rad)
     path = commanded(curve.at(curve.clock(1000.0)), np.zeros((2, 7)))
-    return lost, sum(extreme.broken for extreme in extremes(path))
+    return lost, sum(extreme.part - 1.0 for extreme in extremes(path) if extreme.broken)
 
 
 def _check_followed(reference: Reference, position_m: Array, rotation_rad: Array) -> None:

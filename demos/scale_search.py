@@ -14,13 +14,13 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..envs.collision import CollisionChecker
 from ..envs.diverged import PhysicsError
 from ..envs.reference import Reference
 from ..extract.errors import UserError
 from ..extract.geometry import Array
 from ..extract.progress import Progress
 from .check_trajectory import check
+from .collisions import collisions_of
 from .export import commands_of
 from .impedance import ImpedancePlayer
 from .joints import JointTrajectory
@@ -121,7 +121,7 @@ def _attempt(reference: Reference, change: Change, *, faithful: bool) -> Try:
     changed = with_receptacle_moved(tipped_further(reference, change.tip_deg), change.along_m, change.across_m)
     try:
         joints = retarget(changed)
-        if faithful or (check(commands_of(joints))["ok"] and not _collides(changed, joints)):
+        if faithful or (check(commands_of(joints))["ok"] and not collisions_of(changed, joints.q_rad)):
             poured, spilled = pour(changed, joints)
             return Try(change, changed, poured, spilled, poured - spilled)
     except (UserError, PhysicsError):
@@ -173,14 +173,6 @@ def with_receptacle_moved(reference: Reference, along_m: float, across_m: float)
     T = reference.T_world_receptacle.copy()
     T[:2, 3] += along_m * along + across_m * np.array([-along[1], along[0]])
     return reference.with_header(receptacle={**reference.header["receptacle"], "T_world_receptacle": T.tolist()})
-
-
-def _collides(reference: Reference, joints: JointTrajectory) -> bool:
-    width_m = float(reference.header.get("grasp", {}).get("width_m", 0.0))
-    checker = CollisionChecker(
-        reference.vessel(), reference.T_hand_object, width_m, reference.receptacle(), reference.T_world_receptacle
-    )
-    return bool(checker.check(joints.q_rad, every=max(1, len(joints) // 40)))
 
 
 def _sentence(first: Try, chosen: Try, count: int) -> str:

@@ -102,11 +102,6 @@ def build_reference(
             f"The vessel is {100 * placement.grasp.width_m:.1f} cm wide where it is held, the fingers open to "
             f"{100 * MAX_WIDTH_M:.1f} cm: it can be held in simulation only."
         )
-    notes += [
-        f"Around {resampled.video_time_s[c.knot]:.1f} s of the video the {c.first} touches the {c.second} "
-        f"({1000 * c.depth_m:.0f} mm deep)."
-        for c in placement.collisions
-    ]
     T_world_object = placement.T_world_stage @ stage.T_object
     T_world_camera = _camera_pose(placement.T_world_stage, stage, seen)
     header: dict[str, Any] = {
@@ -134,18 +129,7 @@ def build_reference(
             "seed": seed,
         },
         "notes": notes,
-        "feasibility": {
-            "collisions": [
-                {
-                    "first": c.first,
-                    "second": c.second,
-                    "video_time_s": float(resampled.video_time_s[c.knot]),
-                    "depth_m": c.depth_m,
-                }
-                for c in placement.collisions
-            ],
-            "caught_part_of_jet": caught,
-        },
+        "feasibility": {"caught_part_of_jet": caught},
     }
     reference = Reference.from_poses(T_world_object, stage.time_s, header, resampled.confidence, resampled.video_time_s)
     return slowed(*at_speed(reference, placement.q_rad, speed))

@@ -9,7 +9,7 @@ from vid2demo.demos.feasibility import feasibility
 from vid2demo.demos.joints import JointTrajectory
 from vid2demo.demos.retarget import retarget
 from vid2demo.envs.builtin import builtin_reference
-from vid2demo.envs.kinematics import panda_chain
+from vid2demo.envs.kinematics import configuration_near, panda_chain
 from vid2demo.envs.panda import DQ_MAX_RAD_S, Q_HOME_RAD, Q_MAX_RAD, TAU_MAX_NM
 from vid2demo.envs.reference import Reference, minimum_jerk, vessel_to_header
 from vid2demo.extract.geometry import Array, make_pose
@@ -30,6 +30,23 @@ def moved(target_rad: Array, knots: int = 51, strict: bool = True) -> tuple[Refe
     }
     reference = Reference.from_poses(panda_chain().hand(q) @ T_hand_object, np.arange(knots) / 25.0, header)
     return reference, retarget(reference, strict=strict)
+
+
+def lowered(bottom_m: float) -> tuple[Reference, JointTrajectory]:
+    """An upright mug brought down until its foot is so far above the table, and up again."""
+    mug = make_vessel("mug")
+    T_hand_object = make_pose(np.diag([1.0, -1.0, -1.0]), (0.0, 0.0, 0.02))
+    down = np.minimum(np.arange(51), 50 - np.arange(51)) / 25
+    T = np.tile(np.eye(4), (51, 1, 1))
+    T[:, :3, 3] = (0.5, 0.0, 0.5 * mug.extents_m[2] + bottom_m)
+    T[:, 2, 3] += 0.15 * (1.0 - minimum_jerk(down))
+    header = {
+        "vessel": vessel_to_header(mug),
+        "T_hand_object": T_hand_object.tolist(),
+        "q_start_rad": configuration_near(T[0], T_hand_object, Q_HOME_RAD).tolist(),
+    }
+    reference = Reference.from_poses(T, np.arange(51) / 25.0, header)
+    return reference, retarget(reference)
 
 
 @pytest.fixture(scope="module")
@@ -83,12 +100,32 @@ def test_a_lagging_arm_is_told_with_distance_and_time(easy: tuple[Reference, Joi
     assert "cm off the reference (at " in findings["words"][0]
 
 
-def test_collisions_make_it_infeasible(easy: tuple[Reference, JointTrajectory]) -> None:
-    reference, joints = easy
-    hit = {"first": "hand", "second": "table", "video_time_s": 1.2, "depth_m": 0.01}
-    findings = feasibility(reference.with_header(feasibility={"collisions": [hit]}), joints)
+def test_collisions_make_it_infeasible_and_carried_higher_it_can() -> None:
+    """A mug set down with its foot 15 mm below the table's top."""
+    reference, joints = lowered(-0.015)
+    findings = feasibility(reference, joints)
+    (hit,) = findings["collisions"]
+    assert {hit["first"], hit["second"]} == {"vessel", "table"}
+    assert hit["depth_m"] == pytest.approx(0.015, abs=2e-3)
+    assert hit["time_s"] == pytest.approx(1.0, abs=0.1)
     assert findings["feasible"] is False
-    assert "the hand touches the table around 1.2 s" in findings["words"][0]
+    assert "the vessel touches the table at 1.0 s" in findings["words"][0]
+    variant = findings["variant"]
+    assert variant["words"] == "Carried 2 cm higher, it can."
+    assert variant["distance_m"] == {"mean": pytest.approx(0.02), "max": pytest.approx(0.02)}
+    assert feasibility(*lowered(0.01))["feasible"] is True
+
+
+def test_a_vessel_that_meets_the_receptacle_on_its_way_is_told() -> None:
+    """It goes down through the place where a bowl is put, and not through the one beside it."""
+    reference, joints = lowered(0.05)
+    bowl = make_vessel("bowl")
+    there = reference.T_world_object[25, :3, 3]
+    for aside_m, meets in ((0.0, False), (0.07, True), (0.25, False)):
+        T = make_pose(None, (there[0], there[1] + aside_m, 0.5 * bowl.extents_m[2]))
+        placed = reference.with_header(receptacle={**vessel_to_header(bowl), "T_world_receptacle": T.tolist()})
+        pairs = [{c["first"], c["second"]} for c in feasibility(placed, joints)["collisions"]]
+        assert ({"vessel", "receptacle"} in pairs) is meets
 
 
 def test_tight_margins_are_warned_of(easy: tuple[Reference, JointTrajectory]) -> None:
@@ -154,6 +191,9 @@ def test_too_heavy_and_too_wide_are_told_with_both_numbers(easy: tuple[Reference
     assert findings["feasible"] is False
     assert "10.0 cm wide where it is held, the fingers open to 7.8 cm" in findings["words"][0]
     assert findings["variant"] is None
+    less = feasibility(reference, heavy)["variant"]
+    assert "With at most 2.6" in less["words"]
+    assert feasibility(reference, retarget(reference, contents_kg=less["contents_kg"]))["feasible"] is True
 
 
 def test_what_was_changed_is_told_in_numbers(easy: tuple[Reference, JointTrajectory]) -> None:

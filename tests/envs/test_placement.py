@@ -7,6 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from vid2demo.envs.builtin import arm_trajectory
+from vid2demo.envs.clearance import overlaps_m
+from vid2demo.envs.collision import CollisionChecker
 from vid2demo.envs.jet import filling_m3, jet_of
 from vid2demo.envs.kinematics import limit_margin_rad, panda_chain
 from vid2demo.envs.placement import build_reference, camera_elevation_deg, camera_rotation, without_spin
@@ -140,7 +143,10 @@ def test_start_configuration_and_grasp_belong_together(placed: tuple[ObjectTrack
     np.testing.assert_allclose(held, reference.T_world_object[0], atol=1e-3)
     assert limit_margin_rad(reference.q_start_rad).min() > 0.1
     assert reference.header["grasp"]["fits"]
-    assert reference.header["feasibility"]["collisions"] == []
+    vessel, receptacle, T_receptacle = reference.vessel(), reference.receptacle(), reference.T_world_receptacle
+    checker = CollisionChecker(vessel, reference.T_hand_object, 0.02, receptacle, T_receptacle)
+    assert checker.check(arm_trajectory(reference)) == []
+    assert overlaps_m(vessel, receptacle, reference.T_world_object, T_receptacle).max() == 0.0
 
 
 def test_equal_seeds_give_equal_references(placed: tuple[ObjectTrack, Reference]) -> None:
