@@ -10,6 +10,7 @@ from .geometry import Array
 
 WIDEST_S = 0.5
 MOST_ASKED = 400  # frames, spread over the clip, that choose the bandwidth
+AT_ONCE = 256  # frames, so that memory does not grow with the clip
 STEPS = 9  # bandwidths tried, evenly spaced in their logarithm
 
 
@@ -69,25 +70,30 @@ def _smoothed(
     out = T[asked]
     if bandwidth_s <= 0 or len(T) < 4:
         return out
+    fits = np.concatenate([np.zeros((len(asked), 3)), out[:, :3, 3]], axis=1)
     rotations = Rotation.from_matrix(T[:, :3, :3])
     reach = 3 * bandwidth_s
-    first, last = (
-        np.searchsorted(time_s, time_s[asked] - reach),
-        np.searchsorted(time_s, time_s[asked] + reach, "right"),
-    )
-    for slot, i in enumerate(asked):
+    first = np.searchsorted(time_s, time_s[asked] - reach)
+    last = np.searchsorted(time_s, time_s[asked] + reach, "right")
+    for begin in range(0, len(asked), AT_ONCE):
+        window = np.s_[begin : begin + AT_ONCE]
         # Two neighbours on each side at least, whatever the bandwidth.
-        near = np.arange(max(0, min(first[slot], i - 2)), min(len(T), max(last[slot], i + 3)))
+        near = [
+            np.arange(max(0, min(a, i - 2)), min(len(T), max(b, i + 3)))
+            for i, a, b in zip(asked[window], first[window], last[window], strict=True)
+        ]
         if leave_out:
-            near = near[near != i]
-        if len(near) < 4:
-            continue
-        dt = (time_s[near] - time_s[i]) / bandwidth_s
-        w = np.sqrt(np.exp(-0.5 * dt**2) * np.maximum(weight[near], 1e-3))
-        basis = np.stack([np.ones_like(dt), dt, dt**2], axis=1)
-        turns = (rotations[i].inv() * rotations[near]).as_rotvec()
-        values = np.concatenate([turns, T[near, :3, 3]], axis=1)
-        fit = np.linalg.lstsq(basis * w[:, None], values * w[:, None], rcond=None)[0][0]
-        out[slot, :3, :3] = (rotations[i] * Rotation.from_rotvec(fit[:3])).as_matrix()
-        out[slot, :3, 3] = fit[3:]
+            near = [n[n != i] for i, n in zip(asked[window], near, strict=True)]
+        ends = np.cumsum([len(n) for n in near])
+        middle, beside = np.repeat(asked[window], np.diff(ends, prepend=0)), np.concatenate(near)
+        dt = (time_s[beside] - time_s[middle]) / bandwidth_s
+        w = np.sqrt(np.exp(-0.5 * dt**2) * np.maximum(weight[beside], 1e-3))[:, None]
+        turns = (rotations[middle].inv() * rotations[beside]).as_rotvec()
+        values = w * np.concatenate([turns, T[beside, :3, 3]], axis=1)
+        basis = w * np.stack([np.ones_like(dt), dt, dt**2], axis=1)
+        for slot, (a, b) in enumerate(zip(ends - np.diff(ends, prepend=0), ends, strict=True), begin):
+            if b - a >= 4:
+                fits[slot] = np.linalg.lstsq(basis[a:b], values[a:b], rcond=None)[0][0]
+    out[:, :3, :3] = (rotations[asked] * Rotation.from_rotvec(fits[:, :3])).as_matrix()
+    out[:, :3, 3] = fits[:, 3:]
     return out
