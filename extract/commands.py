@@ -45,6 +45,20 @@ class FromVideo(Staged):
     start_frame: Annotated[int | None, told("N", "Frame of box and mask; followed both ways. Default: chosen.")] = None
     camera_motion: Annotated[Literal["auto", "static", "moving"], arg(help="Whether the camera moves.")] = "auto"
     rerun: Annotated[bool, told(None, "Write extract.rrd as well, for the Rerun viewer.")] = False
+    method: Annotated[
+        Literal["region", "freepose"], arg(help="By outline, colour and texture; or the paper's way, by views.")
+    ] = "region"
+    translation: Annotated[
+        Literal["coarse", "pnp", "fused"] | None,
+        told(None, "Of --method freepose: by single frames, by point tracks or by both. Default: fused."),
+    ] = None
+    level: Annotated[
+        Literal["auto", "foundation", "classical"],
+        arg(help="Of --method freepose: networks where their weights are at hand, or not."),
+    ] = "auto"
+    models_dir: Annotated[
+        Path | None, told("DIR", "Of --method freepose: folder of the networks. Default: as `models list` says.")
+    ] = None
     seed: Seed = 0
 
     def settings(self) -> VideoSettings:
@@ -61,6 +75,10 @@ class FromVideo(Staged):
             camera_motion=self.camera_motion,
             rerun=self.rerun,
             seed=self.seed,
+            method=self.method,
+            translation=self.translation,
+            level=self.level,
+            models_dir=self.models_dir,
         )
 
 

@@ -5,11 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
+from .errors import UserError
 from .progress import Progress
 from .stages import Stage, plain
 from .wording import symmetry_in_words
+
+if TYPE_CHECKING:
+    from .choose import Level
+    from .refine_tracks import Translation
 
 
 @dataclass(frozen=True)
@@ -39,6 +44,8 @@ class VideoSettings:
     camera: (fx, fy, cx, cy) in px, or None: the focal prior.
     start_frame: the frame that boxes and masks belong to, or None: the first, or the best where none are given.
     rerun: whether to write extract.rrd.
+    method: "region" follows outline, colour and texture; "freepose" goes the paper's way. Of that: translation, one of
+    "coarse", "pnp" and "fused", None for the last; level and models_dir, which networks do the seeing.
     """
 
     video: Path
@@ -49,6 +56,16 @@ class VideoSettings:
     camera_motion: Literal["auto", "static", "moving"] = "auto"
     rerun: bool = False
     seed: int = 0
+    method: Literal["region", "freepose"] = "region"
+    translation: Translation | None = None
+    level: Level = "auto"
+    models_dir: Path | None = None
+
+    def __post_init__(self) -> None:
+        if self.method == "region" and (self.translation or self.models_dir or self.level != "auto"):
+            raise UserError("--translation, --level and --models-dir belong to --method freepose; add that")
+        if self.method == "freepose" and self.camera_motion == "moving":
+            raise UserError("--method freepose takes the camera to stand still; leave out --camera-motion moving")
 
 
 def video_identity(path: Path) -> dict[str, Any]:
@@ -83,20 +100,21 @@ def extract_stage(settings: VideoSettings, folder: Path) -> Stage:
     objects = [settings.object, *([settings.receptacle] if settings.receptacle else [])]
 
     def work(progress: Progress) -> Mapping[str, Any]:
-        from .perceive import ObjectRequest, extract
+        from .candidates import ObjectRequest
 
         requests = [ObjectRequest(**vars(o)) for o in objects]
-        tracks = extract(
-            settings.video,
-            requests,
-            camera=settings.camera,
-            start_frame=settings.start_frame,
-            camera_motion=settings.camera_motion,
-            rerun=settings.rerun,
-            out=folder,
-            seed=settings.seed,
-            progress=progress,
-        )
+        shared: dict[str, Any] = {name: getattr(settings, name) for name in ("camera", "start_frame", "rerun", "seed")}
+        shared |= {"out": folder, "progress": progress}
+        if settings.method == "freepose":
+            from .video_pose import extract_by_views
+
+            shared |= {"level": settings.level, "models_dir": settings.models_dir}
+            shared["translation"] = settings.translation or "fused"
+            tracks = extract_by_views(settings.video, requests, **shared)
+        else:
+            from .perceive import extract
+
+            tracks = extract(settings.video, requests, camera_motion=settings.camera_motion, **shared)
         return {name: _track_figures(track) for name, track in tracks.items()}
 
     told: dict[str, Any] = {
@@ -104,6 +122,8 @@ def extract_stage(settings: VideoSettings, folder: Path) -> Stage:
         "camera": settings.camera,
     }
     told |= {"start_frame": settings.start_frame, "camera_motion": settings.camera_motion, "seed": settings.seed}
+    if settings.method != "region":
+        told |= {name: getattr(settings, name) for name in ("method", "translation", "level", "models_dir")}
     files = {f"mesh of {o.name}": o.mesh for o in objects if o.mesh is not None}
     files |= {f"mask of {o.name}": o.mask for o in objects if o.mask is not None}
     outputs = [f"{o.name}.{kind}" for o in objects for kind in ("track.npz", "masks.npz", "mask.png")]
