@@ -48,6 +48,20 @@ class Background:
         _label(_soft(rgb), self.rgb, self.known, gain, DARKEST, SAME_LEVELS, SHADOW_LEVELS, out)
         return out
 
+    def part(self, x_a: int, y_a: int, x_b: int, y_b: int) -> Background:
+        """The background of the pixels [x_a, x_b) x [y_a, y_b)."""
+        window = np.s_[y_a:y_b, x_a:x_b]
+        return Background(np.ascontiguousarray(self.rgb[window]), np.ascontiguousarray(self.known[window]))
+
+    def covered(self, rgb: Image) -> NDArray[np.bool_]:
+        """(H, W) where something stands before a background that is known there."""
+        return np.asarray(self.known & (self.labels(rgb) == FOREGROUND))
+
+
+def doubtful(mask: NDArray[np.bool_], labels: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """(H, W) where a mask of an object says little: a hand may hide the object, or the mask took in a shadow."""
+    return np.asarray(np.where(mask, labels == SHADOW, labels == FOREGROUND))
+
 
 def learn_background(frames: Sequence[Image]) -> Background | None:
     """The background of a clip, from some of its frames (H, W, 3) in order; None when the camera does not stand still.

@@ -6,12 +6,13 @@ over the whole clip (follow.py) and reads the clip in the same order.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
 
+from .background import Background
 from .camera_motion import CameraWatch
 from .cuts import CutWatch
 from .follow import Followed
@@ -19,20 +20,21 @@ from .geometry import Array, project, transform_points
 from .progress import Progress
 from .segment import Box
 from .starting import WORKING_SIDE_PX, Start, resized
-from .video import Image, VideoInfo, iterate_backward, iterate_frames
+from .video import Frame, Image, VideoInfo, iterate_backward, iterate_frames
 
-TRIAL_FRAMES = 15  # that rivals for the first pose are followed before one of them is taken
+TRIAL_FRAMES = 15  # either way, that rivals for the first pose are followed before one of them is taken
 TRIAL_MARGIN = 0.1  # of mean confidence by the outline, by which the one that looked worse at first must be better
 
 
 @dataclass(frozen=True)
 class Clip:
-    """A video and where in it to start. rgb: the start frame at working size; camera_matrix belongs to that size."""
+    """A video and where in it to start. rgb: the start frame at working size, that of camera_matrix and background."""
 
     info: VideoInfo
     start_index: int
     rgb: Image
     camera_matrix: Array
+    background: Background | None = None
 
 
 @dataclass
@@ -49,23 +51,37 @@ def settle_rivals(clip: Clip, starts: Sequence[Start]) -> list[Start]:
 
     Only what is turned far from the best and explains the start frame nearly as well is tried.
     """
-    sure: dict[int, list[float]] = {}
-    trials = [[_begun(clip, start, k) for k in range(len(start.hypotheses))] for start in starts]
-    if all(len(trial) == 1 for trial in trials):
+    if all(len(start.hypotheses) == 1 for start in starts):
         return list(starts)
-    for frame in iterate_frames(clip.info.path, WORKING_SIDE_PX, clip.info):
-        if frame.index < clip.start_index:
-            continue
-        if frame.index > clip.start_index + TRIAL_FRAMES:
-            break
-        for trial in trials:
-            for follower in trial if len(trial) > 1 else ():
-                follower.step(frame.rgb, frame.index - clip.start_index, TRIAL_FRAMES)
+    rivals = [range(len(start.hypotheses)) if len(start.hypotheses) > 1 else () for start in starts]
+    sure: dict[tuple[int, int], list[float]] = {}
+    before: list[float] = []
+
+    def tried(frames: Iterable[Frame]) -> None:
+        trials = {(n, k): _begun(clip, starts[n], k) for n, ks in enumerate(rivals) for k in ks}
+        for frame in frames:
+            away = abs(frame.index - clip.start_index)
+            if away > TRIAL_FRAMES:
+                break
+            for key, follower in trials.items():
+                follower.step(frame.rgb, away, TRIAL_FRAMES)
                 # Texture holds on to any shape: only the outline tells whether it is the right one.
-                sure.setdefault(id(follower), []).append(replace(follower.tracker.signs, rigid=0.0).confidence)
+                sure.setdefault(key, []).append(replace(follower.tracker.signs, rigid=0.0).confidence)
+
+    def ahead() -> Iterator[Frame]:
+        for frame in iterate_frames(clip.info.path, WORKING_SIDE_PX, clip.info):
+            if frame.index <= clip.start_index:
+                before.append(frame.time_s)
+            if frame.index >= clip.start_index:
+                yield frame
+
+    tried(ahead())
+    if clip.start_index > 0:
+        tried(iterate_backward(clip.info.path, before, WORKING_SIDE_PX))
+    means = {key: float(np.mean(values)) for key, values in sure.items()}
     return [
-        start.preferring(_surest([float(np.mean(sure.get(id(follower), [0.0]))) for follower in trial]))
-        for start, trial in zip(starts, trials, strict=True)
+        start.preferring(_surest([means.get((n, k), 0.0) for k in rivals[n]])) if rivals[n] else start
+        for n, start in enumerate(starts)
     ]
 
 
@@ -152,7 +168,10 @@ def _begun(clip: Clip, start: Start, hypothesis: int = 0) -> Followed:
     chosen = start.hypotheses[hypothesis]
     mask, T = resized(chosen.mask, clip.rgb), chosen.pose.T_camera_object
     model = chosen.model
-    return Followed.start(model.mesh, model.vessel, clip.camera_matrix, clip.rgb, mask, T, symmetry=model.symmetry)
+    return Followed.start(
+        model.mesh, model.vessel, clip.camera_matrix, clip.rgb, mask, T,
+        symmetry=model.symmetry, background=clip.background,
+    )  # fmt: skip
 
 
 def _surest(sure: Sequence[float]) -> int:

@@ -15,8 +15,9 @@ from .region import TrackingMesh
 from .segment import Box
 from .shape_fit import tracking_mesh
 from .symmetry import estimate_symmetry
-from .vessels import Vessel, make_vessel, resolve_category
+from .vessels import Vessel, make_vessel, parameter_space, resolve_category
 
+STATURE = 0.6  # of the way from a category's usual height to its least and its greatest
 TRACKED_FACES = 4000  # of a user's mesh: silhouettes do not gain from more
 
 
@@ -62,7 +63,7 @@ def candidate_models(request: ObjectRequest) -> list[Model]:
     Raises UserError for a bad mesh file or unit, and for a name that the library does not know.
     """
     if request.mesh is None:
-        return [vessel_model(make_vessel(category)) for category in resolve_category(request.name)]
+        return [model for category in resolve_category(request.name) for model in _statures(category)]
     mesh = load_mesh(request.mesh, request.mesh_unit)
     light = mesh
     if len(mesh.faces) > TRACKED_FACES:
@@ -82,6 +83,17 @@ def candidate_models(request: ObjectRequest) -> list[Model]:
     }
     tracked = TrackingMesh.build(np.asarray(light.vertices, float), np.asarray(light.faces, np.int32))
     return [Model(tracked, estimate_symmetry(mesh), header)]
+
+
+def _statures(category: str) -> list[Model]:
+    """The nominal vessel of a category, a low and a tall one: one that leans looks like another that does not."""
+    nominal = make_vessel(category)
+    height = parameter_space(category).get("height_m")
+    if height is None:
+        return [vessel_model(nominal)]
+    usual = nominal.params["height_m"]
+    heights = (usual, usual + STATURE * (height.low - usual), usual + STATURE * (height.high - usual))
+    return [vessel_model(make_vessel(category, None, **{**nominal.params, "height_m": h})) for h in heights]
 
 
 def vessel_model(vessel: Vessel) -> Model:

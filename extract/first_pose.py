@@ -22,9 +22,10 @@ from .segment import Box, Mask, mask_box
 from .video import Image
 
 ELEVATIONS_DEG = (0.0, 8.0, 16.0, 26.0, 38.0, 52.0)
-UPRIGHT_BONUS = 0.15  # an outline alone often fits leaning toward and away from the camera as well
+UPRIGHT_BONUS = 0.3  # an outline alone often fits leaning toward and away from the camera as well
 EDGE_WEIGHT = 0.7
 BOX_WEIGHT = 1.2
+UNKNOWN_COST = 0.05  # of what is wrong: next to nothing, as hands hold vessels by what sticks out
 SEARCH_SIDE_PX = 72
 SEARCH_PAD = 0.25  # of the longer side, around the box
 SEARCH_FACES = 1000
@@ -84,6 +85,7 @@ def find_first_pose(
     camera_matrix: Array,
     *,
     box_xywh_px: Box | None = None,
+    unknown: Mask | None = None,
     symmetry: Symmetry = Symmetry(),  # noqa: B008 - frozen
     any_rotation: bool = True,
     stands: bool = True,
@@ -94,6 +96,7 @@ def find_first_pose(
     best of these to the end.
 
     box_xywh_px: box around the whole object; the mask's own when not given.
+    unknown: (H, W) where the mask says nothing, since a hand may hide the object there.
     symmetry: turns after which the mesh looks the same need not be searched.
     any_rotation: also try rotations that are not upright (600 of them, spread over SO(3)).
     stands: whether the object is likely to stand on its -z.
@@ -105,17 +108,20 @@ def find_first_pose(
         tries += list(super_fibonacci_rotations(600))
     box = box_xywh_px or mask_box(mask)
     scale = SEARCH_SIDE_PX / max(box[2], box[3])
+    unknown = np.zeros_like(mask) if unknown is None else unknown
     small_mask, small_camera = _shrunk(mask, camera_matrix, box, scale)
+    small_unknown, _ = _shrunk(unknown, camera_matrix, box, scale)
     pad_px = SEARCH_PAD * SEARCH_SIDE_PX
     small_box = (pad_px, pad_px, box[2] * scale, box[3] * scale)
     light = _with_few_faces(mesh)
     found = []
     for R in tries:
         T = _placed(light, R, small_camera, small_box)
-        found.append(PoseCandidate(T, *silhouette_ious(light, T, small_camera, small_mask, small_box), stands=stands))
+        ious = silhouette_ious(light, T, small_camera, small_mask, small_box, small_unknown)
+        found.append(PoseCandidate(T, *ious, stands=stands))
     found.sort(key=lambda c: c.merit, reverse=True)
 
-    bins, colours = mask_evidence(mask)
+    bins, colours = mask_evidence(mask, unknown)
     edges = edge_strength(rgb)
     for count, steps_px in ROUNDS:
         first = count // 5
@@ -126,7 +132,7 @@ def find_first_pose(
                 mesh, candidate.T_camera_object, camera_matrix, bins, colours, steps_px=steps_px,
                 prior_rotation_rad=0.12, prior_translation=0.05, prior_depth=0.1,
             )  # fmt: skip
-            found.append(judge(mesh, result.T_camera_object, camera_matrix, edges, mask, box, stands))
+            found.append(judge(mesh, result.T_camera_object, camera_matrix, edges, mask, box, stands, unknown))
         found.sort(key=lambda c: c.merit, reverse=True)
     return found
 
@@ -139,10 +145,11 @@ def judge(
     mask: Mask,
     box: Box,
     stands: bool = True,
+    unknown: Mask | None = None,
 ) -> PoseCandidate:
     """How well a pose explains the edges of an image, the mask cut from it and the box around the object."""
-    ious = silhouette_ious(mesh, T_camera_object, camera_matrix, mask, box)
-    edge = edge_score(mesh, T_camera_object, camera_matrix, edges)
+    ious = silhouette_ious(mesh, T_camera_object, camera_matrix, mask, box, unknown)
+    edge = edge_score(mesh, T_camera_object, camera_matrix, edges, unknown)
     return PoseCandidate(T_camera_object, *ious, edge, stands)
 
 
@@ -164,16 +171,29 @@ def distinct(
 
 
 def silhouette_ious(
-    mesh: TrackingMesh, T_camera_object: Array, camera_matrix: Array, mask: Mask, box_xywh_px: Box
+    mesh: TrackingMesh,
+    T_camera_object: Array,
+    camera_matrix: Array,
+    mask: Mask,
+    box_xywh_px: Box,
+    unknown: Mask | None = None,
 ) -> tuple[float, float]:
-    """Intersection over union of the silhouette, cut to the image, with a mask, and of its bounding box with a box."""
+    """Intersection over union of the silhouette, cut to the image, with a mask, and of its bounding box with a box.
+
+    Where the mask is `unknown`, covering is neither right nor wrong.
+    """
     window = render_depth(mesh.vertices_m, mesh.faces, T_camera_object, camera_matrix)
     if window is None:
         return 0.0, 0.0
     silhouette = window.mask_in_image(mask.shape[1], mask.shape[0])
     if not silhouette.any():
         return 0.0, 0.0
-    iou = np.count_nonzero(silhouette & mask) / np.count_nonzero(silhouette | mask)
+    shared, either = silhouette & mask, silhouette | mask
+    if unknown is None:
+        iou = np.count_nonzero(shared) / np.count_nonzero(either)
+    else:
+        doubtful = UNKNOWN_COST * np.count_nonzero(silhouette & unknown)
+        iou = np.count_nonzero(shared & ~unknown) / max(np.count_nonzero(either & ~unknown) + doubtful, 1.0)
     return float(iou), _box_iou(mask_box(silhouette), box_xywh_px)
 
 
@@ -185,20 +205,45 @@ def _box_iou(a: Box, b: Box) -> float:
 
 
 def edge_score(
-    mesh: TrackingMesh, T_camera_object: Array, camera_matrix: Array, strength: NDArray[np.float32]
+    mesh: TrackingMesh,
+    T_camera_object: Array,
+    camera_matrix: Array,
+    strength: NDArray[np.float32],
+    unknown: Mask | None = None,
 ) -> float:
-    """Share of the outline, in [0, 1], along which the image has an edge of the same direction within 2 px."""
+    """Share of outline and jumps within it, in [0, 1], along which the image has an edge of the same direction.
+
+    Within 2 px, and not counting what is `unknown`: the edges there are those of a hand.  Bends of a surface need not
+    show.
+    """
     outline = extract_outline(mesh, T_camera_object, camera_matrix, (strength.shape[0], strength.shape[1]))
-    return 0.0 if outline is None else share_on_edges(outline, strength)
+    if outline is None:
+        return 0.0
+    pixel, normal = outline.pixel, outline.normal
+    if outline.creases is not None:
+        inner, across = outline.creases.seen(T_camera_object, camera_matrix)
+        jump = outline.creases.jump
+        pixel, normal = np.concatenate([pixel, inner[jump]]), np.concatenate([normal, across[jump]])
+    if unknown is not None:
+        x, y = np.clip(np.round(pixel), 0, [unknown.shape[1] - 1, unknown.shape[0] - 1]).astype(int).T
+        told = ~unknown[y, x]
+        pixel, normal = pixel[told], normal[told]
+    return _share_on_edges(pixel, normal, strength)
 
 
 def share_on_edges(outline: Outline, strength: NDArray[np.float32]) -> float:
-    """`edge_score` of an outline drawn before."""
-    best = np.zeros(len(outline))
+    """Share of an outline drawn before, without its inner contours, that runs along image edges; see `edge_score`."""
+    return _share_on_edges(outline.pixel, outline.normal, strength)
+
+
+def _share_on_edges(pixel: Array, normal: Array, strength: NDArray[np.float32]) -> float:
+    if len(pixel) == 0:
+        return 0.0
+    best = np.zeros(len(pixel))
     for offset in range(-2, 3):
-        x, y = np.round(outline.pixel + offset * outline.normal).astype(int).T
+        x, y = np.round(pixel + offset * normal).astype(int).T
         inside = (x >= 0) & (y >= 0) & (x < strength.shape[1]) & (y < strength.shape[0])
-        along = np.abs(np.sum(strength[y * inside, x * inside] * outline.normal, axis=1))
+        along = np.abs(np.sum(strength[y * inside, x * inside] * normal, axis=1))
         best = np.maximum(best, np.where(inside, along, 0.0))
     return float(np.mean(np.minimum(best, 1.0)))
 

@@ -16,34 +16,36 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
+from .background import Background
 from .first_pose import edge_score
 from .geometry import Array, Symmetry, invert_pose
 from .raster import render_depth
 from .region import ColourModel, TrackingMesh, colour_bins, edge_strength
 from .segment import Mask
 from .shape_fit import View, fit_shape, tracking_mesh
-from .spin import best_turns, object_evidence, turn_scores, turned
+from .spin import HIDDEN_EVIDENCE, SURELY_OURS, best_turns, object_evidence, turn_scores, turned
 from .tracker import Estimate, ObjectTracker
 from .vessels import Vessel
 from .video import Image
 
 GLIMPSES = 30  # frames kept for the spin
 FIT_VIEWS = 6  # frames that the shape is fitted to
+WHOLE_EVERY = max(1, GLIMPSES // (2 * FIT_VIEWS))
 SECOND_LOOK_RAD = np.deg2rad(60)  # most that a second look at the spin may change: it mends, it does not turn round
 SURE = 0.5  # least confidence of a frame that the shape may be fitted to
 
 
 @dataclass(frozen=True)
 class Glimpse:
-    """What is kept of a frame: at half size how object-coloured it is and where it has edges, (H, W) both; and, of
-    some frames, all that a shape fit needs."""
+    """What is kept of a frame: at half size how object-coloured it is and where it has edges, (H, W) both, see
+    `turn_scores`; and, of some frames, all that a shape fit needs."""
 
     index: int
     evidence: NDArray[np.float32]
     near_edge: NDArray[np.float32]
-    bins: NDArray[np.int32] | None
-    edges: NDArray[np.float32] | None
-    colours: ColourModel | None
+    bins: NDArray[np.int32] | None = None
+    edges: NDArray[np.float32] | None = None
+    colours: ColourModel | None = None
 
 
 @dataclass
@@ -70,13 +72,14 @@ class Followed:
         T_camera_object: Array,
         guesses: Array | None = None,
         symmetry: Symmetry | None = None,
+        background: Background | None = None,
     ) -> Followed:
         """Ready for the first frame, in which the object has the mask and the pose given.
 
-        symmetry: of the mesh, where it is not a vessel's.
+        symmetry: of the mesh, where it is not a vessel's.  background: of the clip, where it is known.
         """
         symmetry = symmetry if vessel is None else vessel.symmetry
-        tracker = ObjectTracker(mesh, camera_matrix, rgb, mask, T_camera_object, symmetry)
+        tracker = ObjectTracker(mesh, camera_matrix, rgb, mask, T_camera_object, symmetry, background)
         return Followed(mesh, vessel, camera_matrix, mask, tracker, guesses)
 
     def step(self, rgb: Image, index: int, frame_count: int) -> None:
@@ -90,19 +93,22 @@ class Followed:
         self.estimates.append(now if before is None or now.confidence > before.confidence else before)
         stride = max(1, frame_count // GLIMPSES)
         if self.guesses is None and self.vessel is not None and index % stride == 0:
-            bins, colours = colour_bins(rgb), self.tracker.colours
-            edges = edge_strength(rgb)
-            whole = len(self.glimpses) % max(1, GLIMPSES // (2 * FIT_VIEWS)) == 0
-            self.glimpses.append(
-                Glimpse(
-                    index,
-                    object_evidence(bins, colours)[::2, ::2],
-                    _near_edge(edges),
-                    bins if whole else None,
-                    edges if whole else None,
-                    colours.copy() if whole else None,
-                )
-            )
+            self.glimpses.append(self._glimpse(rgb, index, whole=len(self.glimpses) % WHOLE_EVERY == 0))
+
+    def _glimpse(self, rgb: Image, index: int, whole: bool) -> Glimpse:
+        bins, edges, colours = colour_bins(rgb), edge_strength(rgb), self.tracker.colours
+        evidence = object_evidence(bins, colours)
+        strength = np.minimum(np.linalg.norm(edges, axis=-1), 1.0)
+        near_edge = np.asarray(cv2.dilate(strength, np.ones((5, 5), np.uint8)), np.float32)
+        if self.tracker.background is not None:
+            covered = self.tracker.background.covered(rgb)
+            hidden = colours.hides(bins, covered, SURELY_OURS)
+            evidence[hidden], near_edge[hidden] = HIDDEN_EVIDENCE, -1.0
+            colours.hide(bins, covered)
+        evidence, near_edge = evidence[::2, ::2], near_edge[::2, ::2]
+        if not whole:
+            return Glimpse(index, evidence, near_edge)
+        return Glimpse(index, evidence, near_edge, bins, edges, colours.copy())
 
     def second_pass(self, first_rgb: Image) -> Followed:
         """The same object before the first frame again, with spin and shape settled."""
@@ -129,7 +135,10 @@ class Followed:
         return self._begun(self.mesh, self.vessel, first_rgb, self.guesses, index)
 
     def _begun(self, mesh: TrackingMesh, vessel: Vessel | None, first_rgb: Image, poses: Array, index: int) -> Followed:
-        return Followed.start(mesh, vessel, self.camera_matrix, first_rgb, self.first_mask, poses[index], poses)
+        return Followed.start(
+            mesh, vessel, self.camera_matrix, first_rgb, self.first_mask, poses[index], poses,
+            background=self.tracker.background,
+        )  # fmt: skip
 
     @property
     def spin_source(self) -> str:
@@ -188,12 +197,6 @@ class Followed:
                 most = float(np.maximum(glimpse.evidence, 0)[silhouette].sum())
                 total += float(glimpse.evidence[silhouette].sum()) / max(most, 1.0)
         return total / len(glimpses)
-
-
-def _near_edge(edges: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(H / 2, W / 2) strength of the strongest edge within a pixel or two, in [0, 1]."""
-    strength = np.minimum(np.linalg.norm(edges, axis=-1), 1.0)
-    return np.asarray(cv2.dilate(strength, np.ones((5, 5), np.uint8))[::2, ::2], np.float32)
 
 
 def _between_sure(poses: Array, sure: NDArray[np.bool_]) -> Array:

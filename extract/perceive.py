@@ -115,7 +115,7 @@ def extract(
     scene = _Scene(info, camera_matrix, start_scale, scale, samples, background)
     attempts: list[_Attempt] = []
     for index, sharp, starts in _found(scene, requests, models, start_frame):
-        clip = Clip(info, index, _small(sharp, scene), scene.camera(scene.scale))
+        clip = Clip(info, index, _small(sharp, scene), scene.camera(scene.scale), scene.background)
         starts = [sharpened(start, sharp, scene.camera(scene.start_scale)) for start in settle_rivals(clip, starts)]
         followed, watched = follow_both_ways(clip, starts, report, watch_camera=camera_motion != "static")
         attempts.append(_Attempt(index, starts, followed, watched))
@@ -234,7 +234,8 @@ def _find_in(
             if found_box is None:
                 raise NotFoundError(f"object {request.name!r} was not found: nothing looks like it")
             box, source = scaled(found_box, scene.start_scale / scene.scale), "found"
-        starts.append(start_object(request, candidates, sharp, box, source, scene.camera(scene.start_scale), mask))
+        camera = scene.camera(scene.start_scale)
+        starts.append(start_object(request, candidates, sharp, box, source, camera, mask, labels))
     return starts
 
 

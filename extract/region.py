@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from .creases import crease_pixels, measure_creases
 from .geometry import Array, invert_pose, make_pose, project, transform_points
-from .raster import render_depth
+from .raster import DepthWindow, render_depth
 from .region_kernels import (
     count_bins,
     free_lengths,
@@ -32,10 +33,14 @@ from .video import Image
 BITS = 4  # colour resolution per channel of the local histograms
 CHROMA_STEP = 4  # of Lab's a and b, in a bin
 BINS = 1 << (3 * BITS)
+HIDDEN_BIN = BINS - 1  # bright, red and yellow at once: no colour is; of pixels that say nothing
+LEAST_ODDS = 0.4  # of the object's colours against those of a hand, of what is not taken for a hand
+HIDING_RATE = 0.1
 LOCAL_CENTRES = 48
 CLEAR_EDGE = 24.0  # grey levels per px
 SAME_SIDE, SAME_SIZE = float(np.cos(np.deg2rad(1.5))), 0.05  # of views that one outline serves
 POINT_LIMIT_PX = 3.0
+CREASE_WEIGHT = 0.1  # against the outline: a vessel of the library has its creases about there, not just there
 NO_EDGES = np.zeros((0, 0, 2), np.float32)
 
 
@@ -60,6 +65,21 @@ class TrackingMesh:
 
 
 @dataclass(frozen=True)
+class Creases:
+    """Points of inner contours (N, 3) and directions across them (N, 3) in the mesh's frame; which are jumps (N,)."""
+
+    point_object_m: Array
+    normal_object: Array
+    jump: NDArray[np.bool_]
+
+    def seen(self, T_camera_object: Array, camera_matrix: Array) -> tuple[Array, Array]:
+        """Where a pose shows them, (N, 2) px, and which way across, unit (N, 2)."""
+        normal = self.normal_object @ T_camera_object[:2, :3].T
+        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
+        return project(camera_matrix, transform_points(T_camera_object, self.point_object_m)), normal
+
+
+@dataclass(frozen=True)
 class Outline:
     """Sampled outline of the mesh, drawn at one pose and moved along with poses seen from nearly the same side.
 
@@ -76,6 +96,7 @@ class Outline:
     outside_px: NDArray[np.float32]
     nearest: NDArray[np.int32]
     T_drawn: Array
+    creases: Creases | None = None
 
     def __len__(self) -> int:
         return len(self.pixel)
@@ -84,7 +105,7 @@ class Outline:
         """The lines where `keep` (N,) is true."""
         return Outline(
             self.pixel[keep], self.normal[keep], self.point_object_m[keep], self.normal_object[keep],
-            self.inside_px[keep], self.outside_px[keep], self.nearest[keep], self.T_drawn,
+            self.inside_px[keep], self.outside_px[keep], self.nearest[keep], self.T_drawn, self.creases,
         )  # fmt: skip
 
     def inside(self, image_shape: tuple[int, int]) -> Outline | None:
@@ -132,11 +153,13 @@ class ColourModel:
         self.foreground = np.zeros((LOCAL_CENTRES + 1, BINS), np.float32)
         self.background = np.zeros((LOCAL_CENTRES + 1, BINS), np.float32)
         self.seen = np.zeros(LOCAL_CENTRES + 1, np.float32)
+        self.hiding: NDArray[np.float32] = np.zeros(BINS, np.float32)
 
     def copy(self) -> ColourModel:
         """The model as it is now."""
         twin = ColourModel()
         twin.foreground, twin.background, twin.seen = self.foreground.copy(), self.background.copy(), self.seen.copy()
+        twin.hiding = self.hiding.copy()
         return twin
 
     def start_global(self, foreground: NDArray[np.int32], background: NDArray[np.int32]) -> None:
@@ -146,11 +169,37 @@ class ColourModel:
             smooth_histogram(histogram[-1], 1 << BITS)
         self.seen[-1] = 1.0
 
+    def start_hiding(self, bins: NDArray[np.int32]) -> None:
+        """Set the colours of what may hide the object, a hand, from colour bins of pixels that show it."""
+        if len(bins):
+            self.hiding = np.bincount(bins, minlength=BINS).astype(np.float32)
+            smooth_histogram(self.hiding, 1 << BITS)
+
+    def hides(self, bins: NDArray[np.int32], covered: NDArray[np.bool_], odds: float) -> NDArray[np.bool_]:
+        """(H, W) which of the pixels that stand before the background show something else than the object.
+
+        That is, whose colours are less than `odds` times as likely the object's as those of what may hide it.
+        """
+        alien = self.foreground[-1] + 1e-5 < odds * (self.hiding + 1e-5)
+        return np.asarray(covered & alien[bins])
+
+    def hide(self, bins: NDArray[np.int32], covered: NDArray[np.bool_]) -> None:
+        """Blank in `bins` (H, W) what hides the object.
+
+        Whether the object goes on behind it is not known, so that it must not speak for the background.
+        """
+        hidden = self.hides(bins, covered, LEAST_ODDS)
+        fresh = np.bincount(bins[hidden], minlength=BINS).astype(np.float32)
+        if fresh.any():
+            smooth_histogram(fresh, 1 << BITS)
+            self.hiding += HIDING_RATE * (fresh - self.hiding)
+        bins[hidden] = HIDDEN_BIN
+
     def update(self, outline: Outline, bins: NDArray[np.int32], rate: float) -> None:
         """Learn from the lines of a converged outline; `bins` is the (H, W) image of colour bins."""
         learn_lines(
             outline.pixel, outline.normal, outline.inside_px, outline.outside_px, outline.nearest, bins,
-            self.foreground, self.background, self.seen, rate,
+            self.foreground, self.background, self.seen, rate, HIDDEN_BIN,
         )  # fmt: skip
 
 
@@ -161,15 +210,21 @@ def edge_strength(rgb: Image) -> NDArray[np.float32]:
     return strength
 
 
-def mask_evidence(mask: NDArray[np.bool_]) -> tuple[NDArray[np.int32], ColourModel]:
-    """A mask in the form of an image of two colours and their model, so that poses can be refined against it.
+def mask_evidence(
+    mask: NDArray[np.bool_], unknown: NDArray[np.bool_] | None = None
+) -> tuple[NDArray[np.int32], ColourModel]:
+    """A mask in the form of an image of few colours and their model, so that poses can be refined against it.
 
-    The model trusts the mask to four in five, so that a wrong stretch of it does not outvote the rest.
+    The model trusts the mask to four in five, so that a wrong stretch of it does not outvote the rest, and says next
+    to nothing where it is `unknown`.
     """
     colours = ColourModel()
-    colours.foreground[-1, :2], colours.background[-1, :2] = (0.2, 0.8), (0.8, 0.2)
+    colours.foreground[-1, :3], colours.background[-1, :3] = (0.2, 0.8, 0.4), (0.8, 0.2, 0.6)
     colours.seen[-1] = 1.0
-    return mask.astype(np.int32), colours
+    bins = mask.astype(np.int32)
+    if unknown is not None:
+        bins[unknown] = 2
+    return bins, colours
 
 
 def colour_bins(rgb: Image) -> NDArray[np.int32]:
@@ -223,7 +278,19 @@ def draw_outline(mesh: TrackingMesh, T_camera_object: Array, camera_matrix: Arra
     free_lengths(contour.astype(np.float64), normal, mask, inside, outside)
     nearest = mesh.tree.query(points, k=3)[1].astype(np.int32)
     normal_object = normal @ T_camera_object[:2, :3]
-    return Outline(pixel, normal, points, normal_object, inside, outside, nearest, T_camera_object)
+    creases = _draw_creases(window, mesh.radius_m, T_camera_object, camera_matrix)
+    return Outline(pixel, normal, points, normal_object, inside, outside, nearest, T_camera_object, creases)
+
+
+def _draw_creases(window: DepthWindow, radius_m: float, T_camera_object: Array, camera_matrix: Array) -> Creases | None:
+    at, normal, jump = crease_pixels(window.depth_m, camera_matrix, radius_m)
+    if len(at) == 0:
+        return None
+    z = window.depth_m[at[:, 1], at[:, 0]].astype(float)
+    pixel = at + np.array([window.x0_px, window.y0_px]) + 0.5 * normal
+    rays = np.column_stack([(pixel - camera_matrix[:2, 2]) / np.diag(camera_matrix)[:2], np.ones(len(z))])
+    points = transform_points(invert_pose(T_camera_object), rays * z[:, None])
+    return Creases(points, normal @ T_camera_object[:2, :3], jump)
 
 
 @dataclass(frozen=True)
@@ -267,7 +334,7 @@ def measure(
     mean_px, variance, gain = np.zeros(len(outline)), np.zeros(len(outline)), np.zeros(len(outline))
     measure_lines(
         outline.pixel, outline.normal, outline.inside_px, outline.outside_px, outline.nearest, bins,
-        colours.foreground, colours.background, colours.seen, NO_EDGES if edges is None else edges,
+        colours.foreground, colours.background, colours.seen, HIDDEN_BIN, NO_EDGES if edges is None else edges,
         step_px, mean_px, variance, gain,
     )  # fmt: skip
     usable = variance > 0
@@ -333,8 +400,13 @@ def refine(
     def solved(lines: Lines, weight: Array) -> tuple[Array, Array, float]:
         inverse_variance, turn, shift = 1.0 / lines.variance_px2, T[:3, :3].copy(), T[:3, 3].copy()
         found = np.zeros((6, 6))
+        point, target, normal = lines.outline.point_object_m, lines.target_px, lines.outline.normal
+        if edges is not None and outline is not None and outline.creases is not None:
+            inner = _read_creases(outline.creases, T, camera_matrix, bins, edges, lines.step_px)
+            point, target, normal = (np.concatenate(pair) for pair in zip((point, target, normal), inner, strict=False))
+            inverse_variance = np.concatenate([inverse_variance, CREASE_WEIGHT / inner[3]])
         cost = solve_pose(
-            lines.outline.point_object_m, lines.target_px, lines.outline.normal, inverse_variance, lines.step_px,
+            point, target, normal, inverse_variance, lines.step_px,
             points.object_m, points.pixel, weight, POINT_LIMIT_PX, camera_matrix, T_start, prior, iterations,
             turn, shift, found,
         )  # fmt: skip
@@ -353,6 +425,24 @@ def refine(
         T, information, cost = solved(lines, points.weight)
         strain = (cost - alone) / count if alone else 0.0
     return Refinement(T, score, count, information, outline, strain)
+
+
+def _read_creases(
+    creases: Creases,
+    T_camera_object: Array,
+    camera_matrix: Array,
+    bins: NDArray[np.int32],
+    edges: NDArray[np.float32],
+    step_px: float,
+) -> tuple[Array, Array, Array, Array]:
+    """Points (N, 3), targets (N, 2), normals (N, 2) and variances (N,) of the inner contours that show as edges."""
+    pixel, normal = creases.seen(T_camera_object, camera_matrix)
+    mean_px, variance = np.zeros(len(pixel)), np.zeros(len(pixel))
+    measure_creases(pixel, normal, edges, step_px, mean_px, variance)
+    x, y = np.clip(np.round(pixel), 0, [bins.shape[1] - 1, bins.shape[0] - 1]).astype(int).T
+    kept = (variance > 0) & (bins[y, x] != HIDDEN_BIN)
+    target = pixel[kept] + mean_px[kept, None] * normal[kept]
+    return creases.point_object_m[kept], target, normal[kept], variance[kept]
 
 
 def _prior(T: Array, up: Array, rotation_rad: float, spin_rad: float | None, sideways: float, depth: float) -> Array:

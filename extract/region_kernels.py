@@ -103,11 +103,12 @@ def smooth_histogram(histogram: NDArray[np.float32], side: int) -> None:
 def learn_lines(
     pixel: Array, normal: Array, inside: NDArray[np.float32], outside: NDArray[np.float32],
     nearest: NDArray[np.int32], bins: NDArray[np.int32],
-    hist_f: NDArray[np.float32], hist_b: NDArray[np.float32], seen: NDArray[np.float32], rate: float,
+    hist_f: NDArray[np.float32], hist_b: NDArray[np.float32], seen: NDArray[np.float32], rate: float, skipped: int,
 ) -> None:  # fmt: skip
     """Blend the colours on either side of the outline into the histograms (K, BINS) of each line's nearest centres.
 
     `rate` is the share of what is new; a centre not seen before takes all of it. The last row holds all centres.
+    Nothing is learned from the bin `skipped`.
     """
     h, w = bins.shape
     last = hist_f.shape[0] - 1
@@ -126,6 +127,8 @@ def learn_lines(
                 if x < 0 or y < 0 or x >= w or y >= h:
                     break
                 b = bins[y, x]
+                if b == skipped:
+                    continue
                 for j in range(3):
                     k = last if j == 2 else np.int64(nearest[i, j])
                     fresh[which, k, b] += 1.0
@@ -146,10 +149,13 @@ def learn_lines(
 def measure_lines(
     pixel: Array, normal: Array, inside: NDArray[np.float32], outside: NDArray[np.float32],
     nearest: NDArray[np.int32], bins: NDArray[np.int32],
-    hist_f: NDArray[np.float32], hist_b: NDArray[np.float32], seen: NDArray[np.float32], edges: NDArray[np.float32],
-    step_px: float, mean_px: Array, variance: Array, gain: Array,
+    hist_f: NDArray[np.float32], hist_b: NDArray[np.float32], seen: NDArray[np.float32], skipped: int,
+    edges: NDArray[np.float32], step_px: float, mean_px: Array, variance: Array, gain: Array,
 ) -> None:  # fmt: skip
-    """Posterior mean and variance (px) of the outline's position on every line; variance 0 marks an unusable line."""
+    """Posterior mean and variance (px) of the outline's position on every line; variance 0 marks an unusable line.
+
+    Pixels of the bin `skipped` say nothing.
+    """
     h, w = bins.shape
     last = hist_f.shape[0] - 1
     n = 2 * HALF_LINE + 1
@@ -171,6 +177,8 @@ def measure_lines(
             if r < -inside[i] or r > outside[i] or x < 0 or y < 0 or x >= w or y >= h:
                 continue
             b = bins[y, x]
+            if b == skipped:
+                continue
             f, g = 0.15 * hist_f[last, b], 0.15 * hist_b[last, b]
             for k in nearest[i]:
                 if seen[k] > 0:

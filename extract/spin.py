@@ -21,6 +21,8 @@ from .region import ColourModel, TrackingMesh
 
 SPINS = 36
 EVIDENCE_RANGE = (-1.0, 2.0)  # log-odds; skin over a handle must not outvote the frames that show the handle
+SURELY_OURS = 2.0  # times as likely the object's colours as those of a hand: what stands there is not the hand
+HIDDEN_EVIDENCE = 0.3  # where something hides what is there: hands hold vessels by what sticks out
 SPIN_RAD = 2 * np.pi * np.minimum(np.arange(SPINS), SPINS - np.arange(SPINS)) / SPINS  # from none
 TURN_COST = 0.07  # of a change by one step between neighbouring samples, in mean log-odds over the object's area
 MOST_STEPS = 6  # a change by more costs no more: hands may be quick
@@ -46,7 +48,8 @@ def turn_scores(
 ) -> Array:
     """(2, SPINS) how well every spin of a pose, and of its mirror image in depth, explains a picture.
 
-    evidence: (H, W) from `object_evidence`.  edges: (H, W) strength of image edges near each pixel, in [0, 1].
+    evidence: (H, W) from `object_evidence`.  edges: (H, W) strength of image edges near each pixel, in [0, 1],
+    negative where something hides what is there.
     All are divided by one area, so that covering more of the object's colours counts.
     within_rad: no spin is farther than this from none, and nothing is mirrored when it is less than half a turn: what
     is left out is -inf.
@@ -143,6 +146,8 @@ def _sum_up(
                 other = depth[y + (side == 0) - (side == 1), x + (side == 2) - (side == 3)]
                 outside |= other == 0.0
                 behind |= other > d + jump_m
+            if edges[v, u] < 0.0:
+                continue
             if outside:
                 sums[2] += edges[v, u]
                 sums[3] += 1.0

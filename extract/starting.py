@@ -12,7 +12,9 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
+from .background import doubtful
 from .candidates import Model, ObjectRequest, vessel_model
 from .errors import UserError
 from .first_pose import PoseCandidate, distinct, find_first_pose, judge
@@ -58,12 +60,13 @@ class Hypothesis:
 class Start:
     """An object in the start frame, at the starting resolution: its explanations, best first.
 
-    box_source: "given", "mask" or "found".  box: where it was looked for.
+    box_source: "given", "mask" or "found".  box: where it was looked for.  labels: of the background, if it is known.
     """
 
     hypotheses: tuple[Hypothesis, ...]
     box_source: str
     box: Box
+    labels: NDArray[np.uint8] | None = None
 
     @property
     def best(self) -> Hypothesis:
@@ -102,10 +105,12 @@ def start_object(
     source: str,
     camera_matrix: Array,
     mask: Mask | None = None,
+    labels: NDArray[np.uint8] | None = None,
 ) -> Start:
     """What the object may be and how it may stand in the start frame, fitted coarsely, best first.
 
     rgb, box, camera_matrix and mask (cut from the box when None) are at the starting resolution.
+    labels: (H, W) of the background, at any resolution, where it is known.
     Raises NotFoundError when no pose of any candidate explains what is there.
     """
     x, y, w, h = (round(v) for v in box)
@@ -119,7 +124,7 @@ def start_object(
     ranked: list[tuple[PoseCandidate, Model]] = []
     for model in candidates:
         poses = find_first_pose(
-            model.mesh, small, cut, small_camera, box_xywh_px=small_box,
+            model.mesh, small, cut, small_camera, box_xywh_px=small_box, unknown=_unknown(cut, labels),
             symmetry=model.symmetry, stands=model.vessel is not None,
         )  # fmt: skip
         ranked += [(pose, model) for pose in distinct(poses, APART_DEG, HYPOTHESES, HYPOTHESES_WITHIN, model.symmetry)]
@@ -130,7 +135,7 @@ def start_object(
             "was cut out of the frame"
         )
     fits = [
-        _fitted(model, pose, small, cut, small_box, source, small_camera, 1, COARSE_STEPS_PX)
+        _fitted(model, pose, small, cut, small_box, source, small_camera, labels, 1, COARSE_STEPS_PX)
         for pose, model in ranked[:HYPOTHESES]
     ]
     fits.sort(key=lambda fit: fit[1].merit, reverse=True)
@@ -140,13 +145,14 @@ def start_object(
         for model, pose, evidence in fits
         if any(pose is k for k in kept)
     ]
-    return Start(tuple(found), source, box)
+    return Start(tuple(found), source, box, labels)
 
 
 def sharpened(start: Start, rgb: Image, camera_matrix: Array) -> Start:
     """The start with its best hypothesis fitted to the frame at full sharpness, as it was given to `start_object`."""
     best, *others = start.hypotheses
-    fit = _fitted(best.model, best.pose, rgb, best.evidence, start.box, start.box_source, camera_matrix, FIT_ROUNDS)
+    given = start.box, start.box_source
+    fit = _fitted(best.model, best.pose, rgb, best.evidence, *given, camera_matrix, start.labels, FIT_ROUNDS)
     return replace(start, hypotheses=(_hypothesis(*fit, rgb, camera_matrix), *others))
 
 
@@ -167,6 +173,7 @@ def _fitted(
     box: Box,
     source: str,
     camera_matrix: Array,
+    labels: NDArray[np.uint8] | None,
     rounds: int,
     steps_px: tuple[float, ...] = (3.0, 1.5, 1.0),
 ) -> tuple[Model, PoseCandidate, Mask]:
@@ -174,19 +181,29 @@ def _fitted(
     edges, band_px = edge_strength(rgb), max(3, round(RECUT_BAND * max(box[2], box[3])))
     T = pose.T_camera_object
     evidence = _evidence(model.mesh, rgb, T, camera_matrix, mask, band_px)
-    pose = judge(model.mesh, T, camera_matrix, edges, evidence, box, model.vessel is not None)
+    unknown = _unknown(evidence, labels)
+    pose = judge(model.mesh, T, camera_matrix, edges, evidence, box, model.vessel is not None, unknown)
     for _ in range(rounds if model.vessel is not None else 0):
         assert model.vessel is not None
-        view = View(*mask_evidence(evidence), T, box if source == "given" else None, edges)
+        view = View(*mask_evidence(evidence, unknown), T, box if source == "given" else None, edges)
         vessel, (T_fitted,) = fit_shape(model.vessel, [view], camera_matrix, steps_px)
         fitted = vessel_model(vessel)
-        before = judge(model.mesh, T, camera_matrix, edges, evidence, box)
-        after = judge(fitted.mesh, T_fitted, camera_matrix, edges, evidence, box)
+        before = judge(model.mesh, T, camera_matrix, edges, evidence, box, unknown=unknown)
+        after = judge(fitted.mesh, T_fitted, camera_matrix, edges, evidence, box, unknown=unknown)
         if after.merit <= before.merit + 0.002:
             break  # a mask that lost a thin part misled the fit: edges and box tell
         model, T, pose = fitted, T_fitted, after
         evidence = _evidence(model.mesh, rgb, T, camera_matrix, evidence, band_px)
+        unknown = _unknown(evidence, labels)
     return model, pose, evidence
+
+
+def _unknown(mask: Mask, labels: NDArray[np.uint8] | None) -> Mask | None:
+    """Where a mask says little, by the background's labels."""
+    if labels is None:
+        return None
+    size = (mask.shape[1], mask.shape[0])
+    return doubtful(mask, np.asarray(cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST), np.uint8))
 
 
 def scaled(box: Box, scale: float) -> Box:

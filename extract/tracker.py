@@ -14,10 +14,21 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from .background import Background
 from .first_pose import share_on_edges
 from .geometry import Array, Symmetry, make_pose, project, transform_points
 from .raster import render_depth
-from .region import ColourModel, Outline, TrackingMesh, colour_bins, draw_outline, edge_strength, measure, refine
+from .region import (
+    HIDDEN_BIN,
+    ColourModel,
+    Outline,
+    TrackingMesh,
+    colour_bins,
+    draw_outline,
+    edge_strength,
+    measure,
+    refine,
+)
 from .segment import Mask
 from .spin import object_evidence
 from .texture import NO_MATCHES, Matches, Texture, flattened
@@ -56,8 +67,9 @@ class Estimate:
 class Signs:
     """What tells a good pose from a bad one, all in [0, 1].
 
-    agree: share of the outline's lines whose colours put it within 2 px.  on_edges: share of the outline on image
-    edges.  rigid: share of the textured points that move as the pose says, times how far texture is trusted.
+    agree: share of the outline's lines, but those across what hides it, whose colours put it within 2 px.
+    on_edges: share of the outline on image edges, where it is not hidden.  rigid: share of the textured points that
+    move as the pose says, times how far texture is trusted.
     """
 
     agree: float
@@ -106,7 +118,8 @@ class ObjectTracker:
     """Tracks one mesh through the frames of one video, starting from a pose and a mask in one frame.
 
     camera_matrix and all images are at the working resolution.  symmetry: of the mesh; about an axis of revolution
-    only texture can tell a turn, without it there is none.
+    only texture can tell a turn, without it there is none.  background: of the clip, where it is known: tells what
+    may hide the object.
     """
 
     def __init__(
@@ -117,10 +130,12 @@ class ObjectTracker:
         mask: Mask,
         T_camera_object: Array,
         symmetry: Symmetry | None = None,
+        background: Background | None = None,
     ):
         self.mesh, self.camera_matrix = mesh, camera_matrix
         self.symmetry = symmetry or Symmetry()
         self.colours, self.texture = ColourModel(), Texture(mesh)
+        self.background = background
         self.signs = Signs(0.0, 0.0, 0.0)
         self.textured_frames = 0
         self._pose: Array = T_camera_object
@@ -130,6 +145,8 @@ class ObjectTracker:
         bins = colour_bins(rgb)
         near = cv2.dilate(mask.astype(np.uint8), np.ones((41, 41), np.uint8)) > 0
         self.colours.start_global(bins[mask], bins[near & ~mask])
+        if background is not None:
+            self.colours.start_hiding(bins[near & ~mask & background.covered(rgb)])
         inside = None if self._outline is None else self._outline.inside((mask.shape[0], mask.shape[1]))
         if inside is not None:
             self.colours.update(inside, bins, 1.0)
@@ -229,7 +246,9 @@ class ObjectTracker:
         if len(matches):
             held = np.mean(matches.points.errors_px(T, part.camera_matrix) < 2.0)
             rigid = float(held * matches.rigid_share * self.texture.trust)
-        signs = Signs(agree, share_on_edges(outline, part.edges), rigid)
+        x, y = np.round(outline.pixel).astype(int).T
+        told = outline.select(part.bins[y, x] != HIDDEN_BIN)
+        signs = Signs(agree, share_on_edges(told, part.edges), rigid)
         confidence = signs.confidence * min(1.0, 2 * in_view)
         return _Fit(T, confidence, outline, matches, result.strain, signs)
 
@@ -290,7 +309,10 @@ class ObjectTracker:
         image = np.ascontiguousarray(rgb[y_a:y_b, x_a:x_b])
         camera = self.camera_matrix.copy()
         camera[:2, 2] -= (x_a, y_a)
-        return _Part(colour_bins(image), edge_strength(image), flattened(image), camera)
+        bins = colour_bins(image)
+        if self.background is not None:
+            self.colours.hide(bins, self.background.part(x_a, y_a, x_b, y_b).covered(image))
+        return _Part(bins, edge_strength(image), flattened(image), camera)
 
     def _share_in_view(self, T: Array) -> float:
         """Share of the mesh's centres that project into the image."""
