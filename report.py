@@ -17,7 +17,7 @@ import numpy as np
 
 from .demos.joints import JointTrajectory
 from .demos.page_style import SCRIPT, STYLE
-from .demos.plots import Line, Mark, chart, motion_rows
+from .demos.plots import Line, Mark, chart, motion_rows, tries_figure
 from .envs.reference import Reference
 from .extract.errors import UserError
 from .extract.files import write_text
@@ -291,7 +291,9 @@ def _feasibility(found: Found) -> str:
     kind = "well" if found.feasibility.get("feasible", True) else "ill"
     rest = "".join(f"<li>{escape(str(word))}</li>" for word in words[1:])
     first = f'<p class="finding {kind}">{escape(str(words[0]))}</p>' if words else ""
-    return f'{first}<ul class="words">{rest}</ul>'
+    tries = found.feasibility.get("scale_search") or []
+    curve = tries_figure(tries) if len(tries) > 1 else ""
+    return f'{first}<ul class="words">{rest}</ul>{curve}'
 
 
 def _commands(found: Found) -> str:

@@ -214,7 +214,7 @@ def show(title: str, rows: list[dict[str, Any]]) -> None:
     print(f"\n{title}")
     print(" ".join(f"{name:>17}" for name in rows[0]))
     for row in rows:
-        print(" ".join(f"{v:17.3f}" if isinstance(v, float) else f"{v!s:>17}" for v in row.values()), flush=True)
+        print(" ".join(f"{v:17.4f}" if isinstance(v, float) else f"{v!s:>17}" for v in row.values()), flush=True)
 
 
 def main() -> None:

@@ -11,7 +11,9 @@ from ..envs.kinematics import limit_margin_rad, manipulability, panda_chain
 from ..envs.panda import DQ_MAX_RAD_S, PAYLOAD_MAX_KG, TAU_MAX_NM
 from ..extract.geometry import Array
 from .collisions import collisions_of, told
+from .dynamics import payload_of
 from .export import commands_of
+from .grip import grip_of
 from .limits import LIMITS, Extreme, commanded, extremes
 from .retarget import Solver, retarget, tracking_errors
 from .variants import nearest_variant
@@ -32,10 +34,11 @@ def feasibility(reference: Reference, joints: JointTrajectory) -> dict[str, Any]
 
     `feasible`: tracking within 1 cm and 5 degrees, all limits of joints, gripper and payload kept, no collision.
     `limits`: where the motion comes nearest to each limit at 1 kHz, and the margin that is left of it. `phases`: errors
-    before, in and after the pour. `changed`: from the video, in numbers. `variant`: for what is not feasible, the
-    nearest motion found that is, and how far that is away; None if there is none. `collisions`: of arm, vessel, table
-    and receptacle, at every knot. `scale_search`: what `--scale auto`
-    tried and what came of it. `words`: all of it in plain sentences. Raises ValueError when the two differ in length.
+    before, in and after the pour. `collisions`: of arm, vessel, table and receptacle, looked for at every knot. `grip`:
+    what the fingers would have to bear by friction alone. `changed`: from the video, in numbers. `variant`: for what is
+    not feasible, the nearest motion found that is, and how far that is away; None if there is none. `scale_search`:
+    what `--scale auto` tried and what came of it. `words`: all of it in plain sentences. Raises ValueError when the two
+    differ in length.
     """
     findings, problems = _findings(reference, joints)
     findings["feasible"] = not problems
@@ -59,6 +62,8 @@ def _findings(reference: Reference, joints: JointTrajectory) -> tuple[dict[str, 
     found = extremes(commanded(commands.q_rad, commands.tau_nm))
     nearest = {name: max((e for e in found if e.quantity == name), key=lambda e: e.part) for name in LIMITS}
     grasp = reference.header.get("grasp", {})
+    payload = payload_of(reference, float(joints.header.get("contents_kg", 0.0)))
+    grip = grip_of(joints, reference.T_hand_object, payload)
     findings: dict[str, Any] = {
         "position_error_m": _summary(position_m, joints.time_s),
         "rotation_error_rad": _summary(rotation_rad, joints.time_s),
@@ -76,6 +81,7 @@ def _findings(reference: Reference, joints: JointTrajectory) -> tuple[dict[str, 
         "solver": joints.header.get("solver", {}).get("name", "mink"),
         "payload_kg": float(joints.header.get("payload_kg", 0.0)),
         "gripper_width_m": float(grasp.get("width_m", 0.0)),
+        "grip": {**grip.told(), "words": grip.sentence()},
         "caught_part_of_jet": reference.header.get("feasibility", {}).get("caught_part_of_jet"),
         "changed": _changed(reference),
         "scale_search": list(reference.header.get("scale_search", [])),
@@ -213,6 +219,7 @@ def _words(findings: dict[str, Any], problems: list[str], variant: list[str]) ->
         f"At 1 kHz the largest acceleration is {100 * bend['part']:.0f}% of its limit (joint {bend['joint']}), the "
         f"largest jerk {100 * jerk['part']:.0f}% (joint {jerk['joint']}).",
     ]
+    words.append(findings["grip"]["words"])
     if tightest["value"] < _TIGHT_RAD:
         words.append("That is tight: a small change of the motion may not be possible.")
     if findings["time_stretch"] > 1.01:

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -154,6 +154,41 @@ def motion_rows(joints: JointTrajectory, *, clock: str = "") -> str:
         low, high = LIMITS[kind].low, LIMITS[kind].high
         figures.append(joint_rows(title, joints.time_s, value, low, high, unit=unit, factor=factor, clock=clock))
     return "".join(figures)
+
+
+def tries_figure(tries: Sequence[Mapping[str, Any]]) -> str:
+    """A curve of what `--scale auto` tried, in its order: poured and spilled percent, the chosen one with large dots.
+
+    Below each stands its scale, how far the receptacle was moved and how much further the vessel was tipped.
+    """
+    height, foot = HEIGHT + 26.0, 60.0
+    x = _LEFT + (np.arange(len(tries)) + 0.5) / len(tries) * (WIDTH - _LEFT - _RIGHT)
+    low, high = height - foot, _TOP + 6.0
+    parts = []
+    for tick in (0, 25, 50, 75, 100):
+        at = low + (high - low) * tick / 100
+        parts.append(f'<path class="grid" d="M{_LEFT} {at:.1f}H{WIDTH - _RIGHT}"/>')
+        parts.append(f'<text class="tick" x="{_LEFT - 6}" y="{at + 4:.1f}" text-anchor="end">{tick}</text>')
+    keys = ""
+    for color, name in ((1, "poured"), (2, "spilled")):
+        y = low + (high - low) * np.array([float(t[name]) for t in tries])
+        parts.append(f'<path class="line" style="stroke:var(--line-{color})" d="{_path(x, y)}"/>')
+        for at, up, t in zip(x, y, tries, strict=True):
+            radius = 6 if t["chosen"] else 3
+            parts.append(f'<circle cx="{at:.1f}" cy="{up:.1f}" r="{radius}" style="fill:var(--line-{color})"/>')
+        keys += f'<span class="key"><i style="background:var(--line-{color})"></i>{name}</span>'
+    for at, t in zip(x, tries, strict=True):
+        moved_cm = 100.0 * math.hypot(float(t["along_m"]), float(t["across_m"]))
+        words = (f"×{float(t['scale']):.2g}", f"{moved_cm:.0f} cm", f"+{float(t['tip_deg']):.0f}°")
+        for row, text in enumerate(words):
+            parts.append(
+                f'<text class="tick" x="{at:.1f}" y="{low + 18 + 14 * row:.1f}" text-anchor="middle">{text}</text>'
+            )
+    title = "pours tried: path scaled, receptacle moved, tipped further"
+    return (
+        f"<figure><figcaption><b>{title}</b> <small>[%]</small> {keys}</figcaption>"
+        f'<svg viewBox="0 0 {WIDTH:.0f} {height:.0f}" role="img" aria-label="{title}">{"".join(parts)}</svg></figure>'
+    )
 
 
 def ticks(low: float, high: float, count: int = 5) -> list[float]:

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from xml.etree import ElementTree
 
 import cv2
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 from vid2demo import cli
 from vid2demo.demos.figure import _LABEL_PX, _TITLE_PX, ROW_PX, figure, joint_plots
 from vid2demo.demos.joints import JointTrajectory
-from vid2demo.demos.plots import motion_rows
+from vid2demo.demos.plots import motion_rows, tries_figure
 from vid2demo.demos.simulate import PANEL_HEIGHT_PX, STRIP_HEIGHT_PX
 from vid2demo.envs.panda import Q_HOME_RAD, TAU_MAX_NM
 from vid2demo.envs.reference import Reference
@@ -123,3 +124,20 @@ def test_the_report_tells_what_is_left_to_each_limit() -> None:
     assert "12 N m to the limit" in html
     assert "2.5 N m beyond the limit" in html
     assert "125°/s to the limit" in html.replace("125 °/s", "125°/s")
+
+
+def test_the_curve_of_pours_tried_has_a_point_a_try_and_rings_the_chosen() -> None:
+    still = {"scale": 1.0, "along_m": 0.0, "across_m": 0.0, "tip_deg": 0.0}
+    tries = [
+        {**still, "poured": 0.5, "spilled": 0.25, "chosen": False},
+        {**still, "scale": 0.85, "along_m": 0.03, "across_m": 0.04, "poured": 1.0, "spilled": 0.0, "chosen": True},
+    ]
+    root = ElementTree.fromstring(tries_figure(tries))
+    circles = [c for c in root.iter() if c.tag.endswith("circle")]
+    assert [c.get("r") for c in circles] == ["3", "6", "3", "6"]
+    poured, _, spilled, _ = (float(c.get("cy", "nan")) for c in circles)
+    full, nothing = float(circles[1].get("cy", "nan")), float(circles[3].get("cy", "nan"))
+    assert poured == pytest.approx(0.5 * (full + nothing), abs=0.1)
+    assert spilled == pytest.approx(0.75 * nothing + 0.25 * full, abs=0.1)
+    words = [t.text for t in root.iter() if t.tag.endswith("text")]
+    assert words[-3:] == ["×0.85", "5 cm", "+0°"]

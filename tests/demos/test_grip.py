@@ -1,0 +1,62 @@
+"""What the fingers must bear: weight along the pads, its lever about the line between them, and haste on top."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from vid2demo.demos.dynamics import Payload
+from vid2demo.demos.grip import PAD_RADIUS_M, grip_of
+from vid2demo.demos.joints import JointTrajectory
+from vid2demo.envs.kinematics import panda_chain
+from vid2demo.envs.panda import FINGER_MAX_N, Q_HOME_RAD
+from vid2demo.envs.reference import minimum_jerk
+from vid2demo.extract.geometry import Array, make_pose
+
+POINT = np.full(3, 1e-9)
+
+
+def joints_of(q_rad: Array, hz: float = 25.0) -> JointTrajectory:
+    n = len(q_rad)
+    return JointTrajectory(np.arange(n) / hz, q_rad, np.zeros((n, 7)), np.zeros((n, 7)), np.zeros(n))
+
+
+def test_a_weight_that_hangs_between_the_pads_pulls_and_turns_nothing() -> None:
+    grip = grip_of(joints_of(np.tile(Q_HOME_RAD, (20, 1))), np.eye(4), Payload(0.5, np.zeros(3), POINT))
+    assert grip.force_n == pytest.approx(0.5 * 9.81)
+    assert grip.moment_nm == pytest.approx(0.0, abs=1e-9)
+    assert grip.part == pytest.approx(0.5 * 9.81 / (2 * FINGER_MAX_N))
+    assert "would hold" in grip.sentence()
+
+
+@pytest.mark.parametrize(
+    ("side", "turns"), [((0.1, 0.0, 0.0), True), ((0.0, 0.1, 0.0), False), ((0.0, 0.0, 0.1), False)]
+)
+def test_only_a_lever_across_the_closing_line_turns_the_vessel(side: tuple[float, float, float], turns: bool) -> None:
+    """At home the hand points down: x and y of the hand are level."""
+    T_hand = panda_chain().hand(Q_HOME_RAD)[0]
+    assert T_hand[2, 2] == pytest.approx(-1.0, abs=1e-3)
+    grip = grip_of(joints_of(np.tile(Q_HOME_RAD, (20, 1))), make_pose(None, side), Payload(1.0, np.zeros(3), POINT))
+    assert grip.moment_nm == pytest.approx(0.981 if turns else 0.0, abs=2e-3)
+    assert (grip.part > 0.9) is turns
+    if turns:
+        assert grip.part == pytest.approx(np.hypot(9.81, 0.981 / PAD_RADIUS_M) / (2 * FINGER_MAX_N), rel=1e-3)
+
+
+def test_haste_counts_like_weight() -> None:
+    """Thrown upward at 5 m/s^2 a weight is half as heavy again."""
+    move = minimum_jerk(np.linspace(0.0, 1.0, 26))[:, None]
+    q_rad = Q_HOME_RAD + move * np.array([0.0, -0.5, 0.0, 0.0, 0.0, 0.0, 0.0])
+    payload = Payload(1.0, np.zeros(3), POINT)
+    slow, fast = (grip_of(joints_of(q_rad, hz), np.eye(4), payload) for hz in (1.0, 50.0))
+    assert slow.force_n < 9.85
+    z_m = panda_chain().hand(q_rad)[:, 2, 3]
+    assert fast.force_n > 9.81 + 0.5 * np.abs(np.diff(z_m, n=2)).max() * 50.0**2
+    heavy = grip_of(joints_of(q_rad), make_pose(None, (0.12, 0.0, 0.0)), Payload(1.5, np.zeros(3), POINT))
+    assert "would let the vessel slip" in heavy.sentence()
+
+
+def test_what_does_not_weigh_but_is_bulky_resists_being_turned() -> None:
+    turn = minimum_jerk(np.linspace(0.0, 1.0, 26))[:, None] * np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0])
+    still = grip_of(joints_of(Q_HOME_RAD + turn, 50.0), np.eye(4), Payload(0.1, np.zeros(3), POINT))
+    bulky = grip_of(joints_of(Q_HOME_RAD + turn, 50.0), np.eye(4), Payload(0.1, np.zeros(3), np.full(3, 0.02)))
+    assert bulky.moment_nm > still.moment_nm + 0.1
