@@ -24,6 +24,7 @@ SHADOW_LEVELS = 9.0  # by which a shadow may differ from the background made dar
 DARKEST = 0.4  # brightness of a shadow, of the background's
 FOREGROUND, BACKGROUND, SHADOW = 0, 1, 2
 COVERED = (1.0, 0.0, 0.7)  # how likely something is there, by label: grey things pass for shadows
+HIDDEN_TRUST, SHADOW_TRUST = 0.05, 0.5
 ALWAYS, MOSTLY, SOMETIMES, SELDOM = 0.9, 0.5, 0.1, 0.05  # shares of the frames
 NEAR_PX, FADING_PX = 60.0, 8.0  # surroundings that count, the nearer the more
 STEP_LEVELS, FEWEST_PX = 24, 8  # between neighbouring pixels of two things; to decide a part by
@@ -58,9 +59,16 @@ class Background:
         return np.asarray(self.known & (self.labels(rgb) == FOREGROUND))
 
 
-def doubtful(mask: NDArray[np.bool_], labels: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """(H, W) where a mask of an object says little: a hand may hide the object, or the mask took in a shadow."""
-    return np.asarray(np.where(mask, labels == SHADOW, labels == FOREGROUND))
+def mask_trust(mask: NDArray[np.bool_], labels: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """(H, W) in [0, 1] how far a mask of an object is to be believed, by the `labels` of the background.
+
+    Hardly where something else stands before the background, a hand: it may hide the object. Half where it may have
+    taken in a shadow, for grey things pass for shadows.
+    """
+    trust = np.ones(mask.shape, np.float32)
+    trust[~mask & (labels == FOREGROUND)] = HIDDEN_TRUST
+    trust[mask & (labels == SHADOW)] = SHADOW_TRUST
+    return trust
 
 
 def learn_background(frames: Sequence[Image]) -> Background | None:

@@ -16,7 +16,7 @@ from .background import Background
 from .camera_motion import CameraWatch
 from .cuts import CutWatch
 from .follow import Followed
-from .geometry import Array, project, transform_points
+from .geometry import Array, projected_box
 from .progress import Progress
 from .segment import Box
 from .starting import WORKING_SIDE_PX, Start, resized
@@ -148,12 +148,7 @@ def _box(known: Followed, index: int) -> Box | None:
     """Box around an object where the first pass saw it in a frame."""
     if known.guesses is None or index >= len(known.guesses):
         return None
-    points = transform_points(known.guesses[index], known.mesh.vertices_m)
-    if points[:, 2].min() < 1e-3:
-        return None
-    pixels = project(known.camera_matrix, points)
-    (x, y), (w, h) = pixels.min(axis=0), np.ptp(pixels, axis=0)
-    return float(x), float(y), float(w), float(h)
+    return projected_box(known.camera_matrix, known.guesses[index], known.mesh.vertices_m)
 
 
 def _joined(backward: Followed, forward: Followed, start: int) -> Followed:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import fast_simplification
@@ -25,7 +26,7 @@ ELEVATIONS_DEG = (0.0, 8.0, 16.0, 26.0, 38.0, 52.0)
 UPRIGHT_BONUS = 0.3  # an outline alone often fits leaning toward and away from the camera as well
 EDGE_WEIGHT = 0.7
 BOX_WEIGHT = 1.2
-UNKNOWN_COST = 0.05  # of what is wrong: next to nothing, as hands hold vessels by what sticks out
+NO_TRUST = 0.1
 SEARCH_SIDE_PX = 72
 SEARCH_PAD = 0.25  # of the longer side, around the box
 SEARCH_FACES = 1000
@@ -85,7 +86,7 @@ def find_first_pose(
     camera_matrix: Array,
     *,
     box_xywh_px: Box | None = None,
-    unknown: Mask | None = None,
+    trust: NDArray[np.float32] | None = None,
     symmetry: Symmetry = Symmetry(),  # noqa: B008 - frozen
     any_rotation: bool = True,
     stands: bool = True,
@@ -96,7 +97,7 @@ def find_first_pose(
     best of these to the end.
 
     box_xywh_px: box around the whole object; the mask's own when not given.
-    unknown: (H, W) where the mask says nothing, since a hand may hide the object there.
+    trust: (H, W) in [0, 1] how far the mask is to be believed there; everywhere when not given.
     symmetry: turns after which the mesh looks the same need not be searched.
     any_rotation: also try rotations that are not upright (600 of them, spread over SO(3)).
     stands: whether the object is likely to stand on its -z.
@@ -108,20 +109,20 @@ def find_first_pose(
         tries += list(super_fibonacci_rotations(600))
     box = box_xywh_px or mask_box(mask)
     scale = SEARCH_SIDE_PX / max(box[2], box[3])
-    unknown = np.zeros_like(mask) if unknown is None else unknown
-    small_mask, small_camera = _shrunk(mask, camera_matrix, box, scale)
-    small_unknown, _ = _shrunk(unknown, camera_matrix, box, scale)
+    trust = np.ones(mask.shape, np.float32) if trust is None else trust
+    soft_mask, small_camera = _shrunk(mask, camera_matrix, box, scale)
+    small_trust, small_mask = _shrunk(trust, camera_matrix, box, scale)[0], soft_mask > 0.5
     pad_px = SEARCH_PAD * SEARCH_SIDE_PX
     small_box = (pad_px, pad_px, box[2] * scale, box[3] * scale)
     light = _with_few_faces(mesh)
     found = []
     for R in tries:
         T = _placed(light, R, small_camera, small_box)
-        ious = silhouette_ious(light, T, small_camera, small_mask, small_box, small_unknown)
+        ious = silhouette_ious(light, T, small_camera, small_mask, small_box, small_trust)
         found.append(PoseCandidate(T, *ious, stands=stands))
     found.sort(key=lambda c: c.merit, reverse=True)
 
-    bins, colours = mask_evidence(mask, unknown)
+    bins, colours = mask_evidence(mask, trust)
     edges = edge_strength(rgb)
     for count, steps_px in ROUNDS:
         first = count // 5
@@ -132,7 +133,7 @@ def find_first_pose(
                 mesh, candidate.T_camera_object, camera_matrix, bins, colours, steps_px=steps_px,
                 prior_rotation_rad=0.12, prior_translation=0.05, prior_depth=0.1,
             )  # fmt: skip
-            found.append(judge(mesh, result.T_camera_object, camera_matrix, edges, mask, box, stands, unknown))
+            found.append(judge(mesh, result.T_camera_object, camera_matrix, edges, mask, box, stands, trust))
         found.sort(key=lambda c: c.merit, reverse=True)
     return found
 
@@ -145,11 +146,11 @@ def judge(
     mask: Mask,
     box: Box,
     stands: bool = True,
-    unknown: Mask | None = None,
+    trust: NDArray[np.float32] | None = None,
 ) -> PoseCandidate:
     """How well a pose explains the edges of an image, the mask cut from it and the box around the object."""
-    ious = silhouette_ious(mesh, T_camera_object, camera_matrix, mask, box, unknown)
-    edge = edge_score(mesh, T_camera_object, camera_matrix, edges, unknown)
+    ious = silhouette_ious(mesh, T_camera_object, camera_matrix, mask, box, trust)
+    edge = edge_score(mesh, T_camera_object, camera_matrix, edges, trust)
     return PoseCandidate(T_camera_object, *ious, edge, stands)
 
 
@@ -176,11 +177,11 @@ def silhouette_ious(
     camera_matrix: Array,
     mask: Mask,
     box_xywh_px: Box,
-    unknown: Mask | None = None,
+    trust: NDArray[np.float32] | None = None,
 ) -> tuple[float, float]:
     """Intersection over union of the silhouette, cut to the image, with a mask, and of its bounding box with a box.
 
-    Where the mask is `unknown`, covering is neither right nor wrong.
+    Pixels count as far as the mask is to be trusted there.
     """
     window = render_depth(mesh.vertices_m, mesh.faces, T_camera_object, camera_matrix)
     if window is None:
@@ -189,11 +190,10 @@ def silhouette_ious(
     if not silhouette.any():
         return 0.0, 0.0
     shared, either = silhouette & mask, silhouette | mask
-    if unknown is None:
+    if trust is None:
         iou = np.count_nonzero(shared) / np.count_nonzero(either)
     else:
-        doubtful = UNKNOWN_COST * np.count_nonzero(silhouette & unknown)
-        iou = np.count_nonzero(shared & ~unknown) / max(np.count_nonzero(either & ~unknown) + doubtful, 1.0)
+        iou = float(trust[shared].sum()) / max(float(trust[either].sum()), 1.0)
     return float(iou), _box_iou(mask_box(silhouette), box_xywh_px)
 
 
@@ -209,12 +209,12 @@ def edge_score(
     T_camera_object: Array,
     camera_matrix: Array,
     strength: NDArray[np.float32],
-    unknown: Mask | None = None,
+    trust: NDArray[np.float32] | None = None,
 ) -> float:
     """Share of outline and jumps within it, in [0, 1], along which the image has an edge of the same direction.
 
-    Within 2 px, and not counting what is `unknown`: the edges there are those of a hand.  Bends of a surface need not
-    show.
+    Within 2 px, and not counting where the mask is not to be trusted at all: the edges there are those of a hand.
+    Bends of a surface need not show.
     """
     outline = extract_outline(mesh, T_camera_object, camera_matrix, (strength.shape[0], strength.shape[1]))
     if outline is None:
@@ -224,9 +224,9 @@ def edge_score(
         inner, across = outline.creases.seen(T_camera_object, camera_matrix)
         jump = outline.creases.jump
         pixel, normal = np.concatenate([pixel, inner[jump]]), np.concatenate([normal, across[jump]])
-    if unknown is not None:
-        x, y = np.clip(np.round(pixel), 0, [unknown.shape[1] - 1, unknown.shape[0] - 1]).astype(int).T
-        told = ~unknown[y, x]
+    if trust is not None:
+        x, y = np.clip(np.round(pixel), 0, [trust.shape[1] - 1, trust.shape[0] - 1]).astype(int).T
+        told = trust[y, x] > NO_TRUST
         pixel, normal = pixel[told], normal[told]
     return _share_on_edges(pixel, normal, strength)
 
@@ -271,11 +271,11 @@ def _placed(mesh: TrackingMesh, R: Array, camera_matrix: Array, box: Box) -> Arr
     return make_pose(R, inverse @ np.array([*aim, 1.0]) * depth)
 
 
-def _shrunk(mask: Mask, camera_matrix: Array, box: Box, scale: float) -> tuple[Mask, Array]:
-    """The mask around its box at a small size, and the camera that sees it so."""
+def _shrunk(image: NDArray[Any], camera_matrix: Array, box: Box, scale: float) -> tuple[NDArray[np.float32], Array]:
+    """A mask or a map of trust around the box at a small size, and the camera that sees it so."""
     pad = SEARCH_PAD * max(box[2], box[3])
     x0, y0 = box[0] - pad, box[1] - pad
     size = (round((box[2] + 2 * pad) * scale), round((box[3] + 2 * pad) * scale))
     warp = np.array([[scale, 0.0, -x0 * scale], [0.0, scale, -y0 * scale]])
-    small = cv2.warpAffine(mask.astype(np.uint8) * 255, warp, size, flags=cv2.INTER_AREA) > 127
-    return np.asarray(small), np.vstack([warp, [0.0, 0.0, 1.0]]) @ camera_matrix
+    small = cv2.warpAffine(image.astype(np.float32), warp, size, flags=cv2.INTER_AREA)
+    return np.asarray(small, np.float32), np.vstack([warp, [0.0, 0.0, 1.0]]) @ camera_matrix

@@ -105,6 +105,18 @@ def project(camera_matrix: Array, points_camera_m: Array) -> Array:
     return uvw[..., :2] / uvw[..., 2:]
 
 
+def projected_box(
+    camera_matrix: Array, T_camera_object: Array, points_m: Array
+) -> tuple[float, float, float, float] | None:
+    """Box x, y, width, height in px around points (N, 3) of an object; None when one is not before the camera."""
+    points = transform_points(T_camera_object, points_m)
+    if points[:, 2].min() < 1e-3:
+        return None
+    pixels = project(camera_matrix, points)
+    (x, y), (width, height) = pixels.min(axis=0), np.ptp(pixels, axis=0)
+    return float(x), float(y), float(width), float(height)
+
+
 def look_at(eye_m: Array, target_m: Array, up: Array) -> Array:
     """T_world_camera (OpenCV axes) of a camera at `eye_m` that looks at `target_m` with `up` upward in the image."""
     z = np.asarray(target_m, float) - eye_m

@@ -40,6 +40,7 @@ LOCAL_CENTRES = 48
 CLEAR_EDGE = 24.0  # grey levels per px
 SAME_SIDE, SAME_SIZE = float(np.cos(np.deg2rad(1.5))), 0.05  # of views that one outline serves
 POINT_LIMIT_PX = 3.0
+MASK_LEVELS = 11  # of trust in a mask
 CREASE_WEIGHT = 0.1  # against the outline: a vessel of the library has its creases about there, not just there
 NO_EDGES = np.zeros((0, 0, 2), np.float32)
 
@@ -211,20 +212,20 @@ def edge_strength(rgb: Image) -> NDArray[np.float32]:
 
 
 def mask_evidence(
-    mask: NDArray[np.bool_], unknown: NDArray[np.bool_] | None = None
+    mask: NDArray[np.bool_], trust: NDArray[np.float32] | None = None
 ) -> tuple[NDArray[np.int32], ColourModel]:
     """A mask in the form of an image of few colours and their model, so that poses can be refined against it.
 
-    The model trusts the mask to four in five, so that a wrong stretch of it does not outvote the rest, and says next
-    to nothing where it is `unknown`.
+    The model trusts the mask to four in five at most, so that a wrong stretch of it does not outvote the rest, and
+    less where `trust` (H, W), in [0, 1], is less.
     """
+    levels = np.linspace(0, 1, MASK_LEVELS)
+    share = np.concatenate([0.5 - 0.3 * levels, 0.5 + 0.3 * levels])
     colours = ColourModel()
-    colours.foreground[-1, :3], colours.background[-1, :3] = (0.2, 0.8, 0.4), (0.8, 0.2, 0.6)
+    colours.foreground[-1, : len(share)], colours.background[-1, : len(share)] = share, 1 - share
     colours.seen[-1] = 1.0
-    bins = mask.astype(np.int32)
-    if unknown is not None:
-        bins[unknown] = 2
-    return bins, colours
+    level = MASK_LEVELS - 1 if trust is None else np.round(trust * (MASK_LEVELS - 1)).astype(np.int32)
+    return np.asarray(mask * MASK_LEVELS + level, np.int32), colours
 
 
 def colour_bins(rgb: Image) -> NDArray[np.int32]:

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .background import doubtful
+from .background import mask_trust
 from .candidates import Model, ObjectRequest, vessel_model
 from .errors import UserError
 from .first_pose import PoseCandidate, distinct, find_first_pose, judge
@@ -124,7 +124,7 @@ def start_object(
     ranked: list[tuple[PoseCandidate, Model]] = []
     for model in candidates:
         poses = find_first_pose(
-            model.mesh, small, cut, small_camera, box_xywh_px=small_box, unknown=_unknown(cut, labels),
+            model.mesh, small, cut, small_camera, box_xywh_px=small_box, trust=_trust(cut, labels),
             symmetry=model.symmetry, stands=model.vessel is not None,
         )  # fmt: skip
         ranked += [(pose, model) for pose in distinct(poses, APART_DEG, HYPOTHESES, HYPOTHESES_WITHIN, model.symmetry)]
@@ -181,29 +181,29 @@ def _fitted(
     edges, band_px = edge_strength(rgb), max(3, round(RECUT_BAND * max(box[2], box[3])))
     T = pose.T_camera_object
     evidence = _evidence(model.mesh, rgb, T, camera_matrix, mask, band_px)
-    unknown = _unknown(evidence, labels)
-    pose = judge(model.mesh, T, camera_matrix, edges, evidence, box, model.vessel is not None, unknown)
+    trust = _trust(evidence, labels)
+    pose = judge(model.mesh, T, camera_matrix, edges, evidence, box, model.vessel is not None, trust)
     for _ in range(rounds if model.vessel is not None else 0):
         assert model.vessel is not None
-        view = View(*mask_evidence(evidence, unknown), T, box if source == "given" else None, edges)
+        view = View(*mask_evidence(evidence, trust), T, box if source == "given" else None, edges)
         vessel, (T_fitted,) = fit_shape(model.vessel, [view], camera_matrix, steps_px)
         fitted = vessel_model(vessel)
-        before = judge(model.mesh, T, camera_matrix, edges, evidence, box, unknown=unknown)
-        after = judge(fitted.mesh, T_fitted, camera_matrix, edges, evidence, box, unknown=unknown)
+        before = judge(model.mesh, T, camera_matrix, edges, evidence, box, trust=trust)
+        after = judge(fitted.mesh, T_fitted, camera_matrix, edges, evidence, box, trust=trust)
         if after.merit <= before.merit + 0.002:
             break  # a mask that lost a thin part misled the fit: edges and box tell
         model, T, pose = fitted, T_fitted, after
         evidence = _evidence(model.mesh, rgb, T, camera_matrix, evidence, band_px)
-        unknown = _unknown(evidence, labels)
+        trust = _trust(evidence, labels)
     return model, pose, evidence
 
 
-def _unknown(mask: Mask, labels: NDArray[np.uint8] | None) -> Mask | None:
-    """Where a mask says little, by the background's labels."""
+def _trust(mask: Mask, labels: NDArray[np.uint8] | None) -> NDArray[np.float32] | None:
+    """How far a mask is to be believed, by the background's labels."""
     if labels is None:
         return None
     size = (mask.shape[1], mask.shape[0])
-    return doubtful(mask, np.asarray(cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST), np.uint8))
+    return mask_trust(mask, np.asarray(cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST), np.uint8))
 
 
 def scaled(box: Box, scale: float) -> Box:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
-from vid2demo.extract.background import BACKGROUND, FOREGROUND, SHADOW, doubtful
+from vid2demo.extract.background import BACKGROUND, FOREGROUND, HIDDEN_TRUST, SHADOW, SHADOW_TRUST, mask_trust
 from vid2demo.extract.creases import crease_pixels
 from vid2demo.extract.geometry import make_pose, project, rotation_angle_rad, transform_points
 from vid2demo.extract.raster import render_depth
@@ -182,7 +182,8 @@ def test_a_hand_before_the_object_does_not_pull_its_outline() -> None:
     assert errors[0][0] < errors[1][0]
 
 
-def test_a_mask_is_doubtful_over_its_shadows_and_beside_what_covers_the_background() -> None:
+def test_a_mask_is_half_trusted_over_shadows_and_hardly_beside_what_covers_the_background() -> None:
     mask = np.array([[True, True, True, False, False, False]])
     labels = np.array([[FOREGROUND, SHADOW, BACKGROUND, FOREGROUND, SHADOW, BACKGROUND]], np.uint8)
-    assert doubtful(mask, labels).tolist() == [[False, True, False, True, False, False]]
+    trusts = [1, SHADOW_TRUST, 1, HIDDEN_TRUST, 1, 1]
+    assert np.allclose(mask_trust(mask, labels), [trusts])
