@@ -20,13 +20,13 @@ from .errors import UserError
 from .geometry import make_pose
 from .image_pose import ImagePoser, ObjectPose
 from .mesh_store import About
+from .neural_segment import FOR_IMAGES, large_enough
 from .progress import Progress
 from .protocols import Proposal, Segmenter
 from .segment import mask_box
 
 Meshes = Literal["retrieved", "true"]
 Sizes = Literal["own", "true", "constant"]
-LEAST_PX = 100  # of a mask, and 5 px of its box, as in the authors' code
 CONSTANT_M = 0.1
 
 
@@ -68,7 +68,7 @@ def pose_dataset(
         if segmenter is None:
             proposals, obj_ids = _true_proposals(dataset, image)
         else:
-            proposals = [p for p in segmenter.propose(rgb, prompt) if large_enough(p)]
+            proposals = [p for p in segmenter.propose(rgb, prompt) if large_enough(p.mask, FOR_IMAGES)]
             obj_ids = [0] * len(proposals)
         keys = [_key_of(known, obj_id) for obj_id in obj_ids] if meshes == "true" else None
         sizes_m = None
@@ -86,13 +86,6 @@ def pose_dataset(
     return found
 
 
-def large_enough(proposal: Proposal) -> bool:
-    """Whether a proposal shows enough to be judged."""
-    if np.count_nonzero(proposal.mask) < LEAST_PX:
-        return False
-    return min(mask_box(proposal.mask)[2:]) >= 5
-
-
 def mesh_word(about: About) -> str:
     """How a results file names a mesh: "library:CATEGORY:SEED", or the path of its file."""
     return about.source.replace("/", ":") if about.source.startswith("library/") else about.source
@@ -106,7 +99,7 @@ def _true_proposals(dataset: Dataset, image: ImageKey) -> tuple[list[Proposal], 
             raise UserError(f"{dataset.root}: scene {image.scene_id}, image {image.im_id} has no visible masks")
         if mask.any():
             proposal = Proposal(mask, mask_box(mask), 1.0)
-            if large_enough(proposal):
+            if large_enough(proposal.mask, FOR_IMAGES):
                 proposals.append(proposal)
                 obj_ids.append(there.obj_id)
     return proposals, obj_ids

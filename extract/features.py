@@ -163,18 +163,24 @@ def unit(vectors: Floats) -> Floats:
 
 
 def make_features(name: str, options: Mapping[str, str] | None = None) -> PatchFeatures:
-    """The encoder of a name: "classical", or a network for features that `vid2demo models list` shows.
+    """The encoder of a name: "classical", a network for features that `vid2demo models list` shows, or an .onnx file.
 
     options: of a network: models_dir, device, and block, after which tokens are taken.
     Raises UserError for an unknown name and when weights are missing.
     """
     if name == "classical":
         return ClassicalFeatures()
+    if name.endswith(".onnx"):
+        from .onnx_models import OnnxPatchFeatures
+
+        if block := (options or {}).get("block"):
+            raise UserError(f"--block {block}: the block was chosen when {name} was exported; leave it out")
+        return OnnxPatchFeatures(Path(name))
     from .choose import choose
     from .models import cards_for
 
     if name not in (known := [card.name for card in cards_for("features")]):
-        raise UserError(f"unknown patch features {name!r}; there are classical, {', '.join(known)}")
+        raise UserError(f"unknown patch features {name!r}; there are classical, {', '.join(known)} and .onnx files")
     chosen = dict(options or {})
     models_dir, device = chosen.pop("models_dir", None), chosen.pop("device", "auto")
     made: PatchFeatures = choose(
@@ -196,6 +202,8 @@ def features_of(encoder: str, options: Mapping[str, str] | None = None) -> Patch
     """
     if encoder == ClassicalFeatures().name:
         return ClassicalFeatures()
+    if encoder.endswith("-onnx"):
+        return _exported(encoder, (options or {}).get("models_dir"))
     from .models import cards_for
 
     model = next((card.name for card in cards_for("features") if encoder.startswith(card.name)), None)
@@ -206,6 +214,19 @@ def features_of(encoder: str, options: Mapping[str, str] | None = None) -> Patch
     if made.name != encoder:
         raise UserError(f"the database was made with {encoder}, here is {made.name}; use those weights and that device")
     return made
+
+
+def _exported(encoder: str, models_dir: str | None) -> PatchFeatures:
+    """The encoder of this name in the .onnx files of the folder of networks."""
+    from .model_folder import models_folder
+    from .onnx_models import OnnxPatchFeatures, open_network
+
+    folder = models_folder(Path(models_dir) if models_dir else None)
+    for path in sorted(folder.glob("*.onnx")):
+        _, facts = open_network(path)
+        if facts.get("part") == "features" and f"{facts['name']}-onnx" == encoder:
+            return OnnxPatchFeatures(path)
+    raise UserError(f"the database was made with {encoder}, which no .onnx file in {folder} is; name its --models-dir")
 
 
 def usual_descriptor(encoder: str) -> str:

@@ -9,12 +9,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from .bop_pose import large_enough
 from .errors import UserError
 from .masks import read_mask
-from .protocols import Box, Image, Mask, PatchFeatures, Proposal, Segmenter
+from .neural_segment import FOR_VIDEOS, large_enough
+from .protocols import Box, Image, Mask, PatchFeatures, Segmenter
 from .retrieval import FRAMES, Hit, Retriever, look_at_object, spread_frames
-from .segment import check_box, mask_box
+from .segment import check_box
 from .video import iterate_frames, read_video_info
 
 WORK_SIDE_PX = 640
@@ -65,7 +65,7 @@ def find_in_video(
     # Whoever carries the masks may read ahead; the pictures must not get out of step with them.
     seen, carried = tee(frame.rgb for frame in chain([first], stream))
     for index, (rgb, (mask,)) in enumerate(zip(seen, segmenter.propagate(carried, [np.asarray(start)]), strict=False)):
-        if index in chosen and mask.any() and large_enough(Proposal(mask, mask_box(mask), 1.0)):
+        if index in chosen and large_enough(mask, FOR_VIDEOS):
             shown.append((rgb, mask))
             voted.append(index)
     if not shown:

@@ -37,11 +37,7 @@ class NeuralDepth:
         if getattr(self._network.config, "depth_estimation_type", "metric") != "metric":
             raise UserError(f"{folder} knows no metres (relative depth); take a Metric one, such as {card.repository}")
         self._processor = load_processor(AutoImageProcessor, card, folder)
-        self._name = described(card, folder, self._placement)
-
-    @property
-    def name(self) -> str:
-        return self._name
+        self.name = described(card, folder, self._placement)
 
     def estimate(self, rgb: Image, camera_matrix: NDArray[np.float64] | None = None) -> Floats:
         """(H, W) depth along the camera's z [m]; the camera matrix is not looked at: the network guesses the lens."""

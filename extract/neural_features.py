@@ -50,41 +50,20 @@ class NeuralPatchFeatures:
         self._placement = place(device, precision)
         self._network = load_patch_encoder(card.name, self._folder, self._placement, block)
         config = self._network.config
-        self._grid, self._patch_px = grid, int(config.patch_size)
-        self._size, self._skip = int(config.hidden_size), 1 + int(config.num_register_tokens)
+        self.grid, self.crop_px = grid, grid * int(config.patch_size)
+        self.patch_size = self.summary_size = int(config.hidden_size)
+        self._skip = 1 + int(config.num_register_tokens)
         self._mean, self._std = normalisation(card.name, self._folder)
         self._batch = batch or self._placement.batch
         settings = (f"block{config.num_hidden_layers}", f"{self.crop_px}px")
-        self._name = described(card, self._folder, self._placement, *settings)
-
-    @property
-    def name(self) -> str:
-        return self._name
-
-    @property
-    def crop_px(self) -> int:
-        return self._grid * self._patch_px
-
-    @property
-    def grid(self) -> int:
-        return self._grid
-
-    @property
-    def patch_size(self) -> int:
-        return self._size
-
-    @property
-    def summary_size(self) -> int:
-        return self._size
+        self.name = described(card, self._folder, self._placement, *settings)
 
     def encode(self, crops: NDArray[np.uint8], masks: NDArray[np.bool_]) -> PatchGrid:
         """Features of crops (B, S, S, 3); the masks are not looked at."""
-        side = self.crop_px
-        if crops.ndim != 4 or crops.shape[1:] != (side, side, 3) or crops.dtype != np.uint8:
-            raise ValueError(f"crops must be (B, {side}, {side}, 3) uint8, got {crops.shape} {crops.dtype}")
+        check_crops(crops, self.crop_px)
         import torch
 
-        tokens = np.empty((len(crops), 1 + self._grid**2, self._size), np.float32)
+        tokens = np.empty((len(crops), 1 + self.grid**2, self.patch_size), np.float32)
         with torch.inference_mode():
             for start in range(0, len(crops), self._batch):
                 part = slice(start, start + self._batch)
@@ -92,7 +71,18 @@ class NeuralPatchFeatures:
                 out = self._network(pixels.to(self._placement.device, self._placement.dtype)).last_hidden_state
                 out = out.float().cpu().numpy()
                 tokens[part, 0], tokens[part, 1:] = out[:, 0], out[:, self._skip :]
-        return PatchGrid(tokens[:, 1:].reshape(-1, self._grid, self._grid, self._size), tokens[:, 0])
+        return grid_of_tokens(tokens, self.grid)
+
+
+def check_crops(crops: NDArray[np.uint8], side_px: int) -> None:
+    """Raise ValueError unless crops are (B, S, S, 3) uint8 of the side an encoder takes."""
+    if crops.ndim != 4 or crops.shape[1:] != (side_px, side_px, 3) or crops.dtype != np.uint8:
+        raise ValueError(f"crops must be (B, {side_px}, {side_px}, 3) uint8, got {crops.shape} {crops.dtype}")
+
+
+def grid_of_tokens(tokens: Floats, grid: int) -> PatchGrid:
+    """The features in tokens (B, 1 + G * G, D), class token first."""
+    return PatchGrid(tokens[:, 1:].reshape(-1, grid, grid, tokens.shape[-1]), tokens[:, 0])
 
 
 def prepared(crops: NDArray[np.uint8], mean: Floats, std: Floats) -> Floats:

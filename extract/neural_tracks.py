@@ -43,11 +43,7 @@ class NeuralTracks:
                 f"{path} cannot be read as {model} ({error}); get it again: `{pull_command(card)}`"
             ) from error
         self._network.to(self._placement.device).eval()
-        self._name = f"{card.name}3-offline"
-
-    @property
-    def name(self) -> str:
-        return self._name
+        self.name = f"{card.name}3-offline"
 
     def track(self, frames: NDArray[np.uint8], frame_index: NDArray[np.int64], pixels_px: Floats) -> PointTracks:
         """Follow points (P, 2), each given in frame `frame_index` (P,), through frames (N, H, W, 3)."""

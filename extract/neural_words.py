@@ -43,16 +43,8 @@ class NeuralWords:
         self._padding = "max_length" if self._network.config.model_type == "siglip" else True
         self._length = int(text.max_position_embeddings)
         self._batch = batch or 2 * self._placement.batch
-        self._name = described(card, folder, self._placement)
-        self._size = self.encode_texts(["mug"]).shape[1]
-
-    @property
-    def name(self) -> str:
-        return self._name
-
-    @property
-    def size(self) -> int:
-        return self._size
+        self.name = described(card, folder, self._placement)
+        self.size = int(self.encode_texts(["mug"]).shape[1])
 
     def encode_texts(self, texts: Sequence[str]) -> Floats:
         """(N, size) unit vectors; texts longer than the network reads are cut."""
@@ -84,7 +76,7 @@ class NeuralWords:
                 out = features(items[start : start + self._batch])
                 found.append(getattr(out, "pooler_output", out).float().cpu().numpy())
         if not found:
-            return np.zeros((0, self._size), np.float32)
+            return np.zeros((0, self.size), np.float32)
         vectors = np.concatenate(found)
         return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True), np.float32)
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from .errors import UserError
 from .neural_depth import NEAREST_M
-from .neural_features import prepared
+from .neural_features import check_crops, grid_of_tokens, prepared
 from .protocols import Floats, Image, PatchGrid
 
 BATCH = 8
@@ -28,41 +28,20 @@ class OnnxPatchFeatures:
         Raises UserError for a missing or damaged file, or one of another kind.
         """
         self._session, facts = open_network(path, "features", threads)
-        self._grid, self._batch = int(facts["grid"]), batch
+        self.grid, self._batch = int(facts["grid"]), batch
         self._mean, self._std = _numbers(facts["mean"]), _numbers(facts["std"])
-        self._side = int(self._session.get_inputs()[0].shape[2])
-        self._size = int(self._session.get_outputs()[0].shape[2])
-        self._name = f"{facts['name']}-onnx"
-
-    @property
-    def name(self) -> str:
-        return self._name
-
-    @property
-    def crop_px(self) -> int:
-        return self._side
-
-    @property
-    def grid(self) -> int:
-        return self._grid
-
-    @property
-    def patch_size(self) -> int:
-        return self._size
-
-    @property
-    def summary_size(self) -> int:
-        return self._size
+        self.crop_px = int(self._session.get_inputs()[0].shape[2])
+        self.patch_size = self.summary_size = int(self._session.get_outputs()[0].shape[2])
+        self.name = f"{facts['name']}-onnx"
 
     def encode(self, crops: NDArray[np.uint8], masks: NDArray[np.bool_]) -> PatchGrid:
         """Features of crops (B, S, S, 3) uint8; the masks are not looked at."""
-        if crops.ndim != 4 or crops.shape[1:] != (self._side, self._side, 3) or crops.dtype != np.uint8:
-            raise ValueError(f"crops must be (B, {self._side}, {self._side}, 3) uint8, got {crops.shape} {crops.dtype}")
-        tokens = np.empty((len(crops), 1 + self._grid**2, self._size), np.float32)
+        check_crops(crops, self.crop_px)
+        tokens = np.empty((len(crops), 1 + self.grid**2, self.patch_size), np.float32)
         for start in range(0, len(crops), self._batch):
             part = slice(start, start + self._batch)
             (tokens[part],) = self._session.run(None, {"pixels": prepared(crops[part], self._mean, self._std)})
-        return PatchGrid(tokens[:, 1:].reshape(-1, self._grid, self._grid, self._size), tokens[:, 0])
+        return grid_of_tokens(tokens, self.grid)
 
 
 class OnnxDepth:
@@ -74,11 +53,7 @@ class OnnxDepth:
         self._mean, self._std = _numbers(facts["mean"]), _numbers(facts["std"])
         self._height, self._width = (int(side) for side in self._session.get_inputs()[0].shape[2:])
         self._rim = ZOEDEPTH_RIM if facts["rim"] else 0.0
-        self._name = f"{facts['name']}-onnx"
-
-    @property
-    def name(self) -> str:
-        return self._name
+        self.name = f"{facts['name']}-onnx"
 
     def estimate(self, rgb: Image, camera_matrix: NDArray[np.float64] | None = None) -> Floats:
         """(H, W) depth along the camera's z [m]; the camera matrix is not looked at."""
@@ -95,8 +70,11 @@ class OnnxDepth:
         return np.asarray(np.maximum(np.nan_to_num(inner, nan=NEAREST_M), NEAREST_M), np.float32)
 
 
-def open_network(path: Path, part: str, threads: int | None = None) -> tuple[Any, dict[str, str]]:
-    """An ONNX Runtime session and the facts in its file. Raises UserError for a missing, damaged or other file."""
+def open_network(path: Path, part: str | None = None, threads: int | None = None) -> tuple[Any, dict[str, str]]:
+    """An ONNX Runtime session and the facts in its file, which must be a network for `part` where that is given.
+
+    Raises UserError for a missing, damaged or other file.
+    """
     if importlib.util.find_spec("onnxruntime") is None:
         raise UserError("ONNX files are run by onnxruntime; install it with `pip install 'vid2demo[onnx]'`")
     import onnxruntime
@@ -112,7 +90,7 @@ def open_network(path: Path, part: str, threads: int | None = None) -> tuple[Any
     except Exception as error:  # the runtime's errors have no common type
         raise UserError(f"{path} cannot be read as an ONNX file ({error}); export it again") from error
     facts = dict(session.get_modelmeta().custom_metadata_map)
-    if facts.get("part") != part:
+    if part not in (None, facts.get("part")):
         what = f"a network for {facts['part']}" if "part" in facts else "not one of `vid2demo models export`"
         raise UserError(f"{path} is {what}, where one for {part} is needed")
     return session, facts

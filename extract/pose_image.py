@@ -11,7 +11,6 @@ from typing import Any
 import cv2
 import numpy as np
 
-from .bop_pose import large_enough
 from .choose import Level, choose
 from .classical_segment import ClassicalSegmenter
 from .errors import UserError
@@ -21,6 +20,7 @@ from .image_pose import ImagePoser, PoseSettings
 from .masks import read_mask
 from .mesh_store import MeshStore
 from .model_folder import models_folder
+from .neural_segment import FOR_IMAGES, large_enough
 from .pose_output import write_poses
 from .protocols import Box, DepthEstimator, Image, Proposal, Segmenter, TextImageEncoder
 from .scale import SizeReader
@@ -112,7 +112,7 @@ def _proposals(rgb: Image, settings: PictureSettings, kind: dict[str, Any]) -> t
         boxes = [check_box(box, width, height) for box in settings.boxes_xywh_px]
         by_hand += _cut(chosen.made, rgb, boxes)
         return by_hand, f"boxes by hand, {chosen.line()}"
-    found = [p for p in chosen.made.propose(rgb, settings.prompt) if large_enough(p)]
+    found = [p for p in chosen.made.propose(rgb, settings.prompt) if large_enough(p.mask, FOR_IMAGES)]
     if not found:
         raise UserError(f"no object was found in {settings.image}; point at one with --box X Y W H")
     return found, chosen.line()

@@ -7,9 +7,13 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
+import trimesh
+from vid2demo.cli import main
 from vid2demo.extract.errors import UserError
+from vid2demo.extract.features import features_of
 from vid2demo.extract.neural_depth import NeuralDepth
 from vid2demo.extract.neural_features import NeuralPatchFeatures
 from vid2demo.extract.onnx_export import export_model, metadata
@@ -94,6 +98,32 @@ print(found.patches.shape, "torch" in sys.modules, "transformers" in sys.modules
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False)
     assert done.stdout.strip() == "(1, 2, 2, 32) False False", done.stderr
+
+
+def test_an_exported_encoder_fills_a_database_and_poses_by_it(tiny_models: Path, tmp_path: Path) -> None:
+    """Its .onnx file names it where meshes are taken in; later it is found by what the database says."""
+    models = tmp_path / "models"
+    models.mkdir()
+    path = models / "anything.onnx"
+    export_model("dinov2-small", path, models_dir=tiny_models, grid=4)
+    export_model("depth-anything-small", models / "a-depth.onnx", models_dir=tiny_models, picture_px=(64, 48))
+    (tmp_path / "in").mkdir()
+    trimesh.creation.box([0.1, 0.1, 0.2]).export(tmp_path / "in" / "box.ply")
+    db = str(tmp_path / "db")
+    words = ["meshes", "onboard", str(tmp_path / "in"), "--out", db, "--views", "3"]
+    assert main([*words, "--features", str(path)]) == 0
+    assert main([*words, "--features", str(path), "--block", "2"]) == 2
+    picture = np.full((120, 160, 3), 200, np.uint8)
+    picture[30:90, 40:80] = (90, 40, 30)
+    cv2.imwrite(str(tmp_path / "table.png"), picture)
+    pose = ["pose", str(tmp_path / "table.png"), "--db", db, "--box", "38", "28", "44", "64"]
+    pose += ["--level", "classical", "--out", str(tmp_path / "out")]
+    assert main([*pose, "--models-dir", str(models)]) == 0
+    told = json.loads((tmp_path / "out/poses.json").read_text())
+    assert told["encoder"] == f"{open_network(path)[1]['name']}-onnx"
+    assert [found["name"] for found in told["objects"]] == ["box"]
+    with pytest.raises(UserError, match=r"which no \.onnx file in .* is; name its --models-dir"):
+        features_of(told["encoder"], {"models_dir": str(tmp_path)})
 
 
 def test_facts_in_the_file_are_read_back(tiny_models: Path, tmp_path: Path) -> None:
