@@ -16,6 +16,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -210,10 +211,12 @@ def table_time(pours: list[Pour]) -> list[dict[str, Any]]:
     return rows
 
 
-def show(title: str, rows: list[dict[str, Any]]) -> None:
+def show(title: str, rows: Iterable[dict[str, Any]]) -> None:
+    """Print rows as they come; they may take minutes each."""
     print(f"\n{title}")
-    print(" ".join(f"{name:>17}" for name in rows[0]))
-    for row in rows:
+    for number, row in enumerate(rows):
+        if number == 0:
+            print(" ".join(f"{name:>17}" for name in row))
         print(" ".join(f"{v:17.4f}" if isinstance(v, float) else f"{v!s:>17}" for v in row.values()), flush=True)
 
 
@@ -234,19 +237,17 @@ def main() -> None:
     seeds = range(arguments.first, arguments.first + arguments.pours)
     pours = list(each(partial(make_pour, arguments.clips), seeds))
     execute = partial(execute_pour, particles=arguments.particles, grasp=arguments.grasp)
-    make = {
+    make: dict[str, Any] = {
         "solve": lambda: table_solve(list(each(solve_pour, pours))),
         "weights": lambda: table_weights(list(each(weights_pour, pours))),
-        "execute": lambda: list(each(execute, pours)),
+        "execute": lambda: each(execute, pours),
         "time": lambda: table_time(pours),
     }
-    result = {}
-    for name in arguments.tables:
-        result[name] = make[name]()
-        if not arguments.json:
-            show(name, result[name])
     if arguments.json:
-        print(json.dumps(result, indent=2))
+        print(json.dumps({name: list(make[name]()) for name in arguments.tables}, indent=2))
+    else:
+        for name in arguments.tables:
+            show(name, make[name]())
 
 
 if __name__ == "__main__":

@@ -63,9 +63,9 @@ class TorqueWeights:
 
     position_1_m2: float = 2e6
     rotation_1_rad2: float = 8e4
-    patience: float = 50.0
-    unsure_m: float = 2e-3
-    unsure_rad: float = 1e-2
+    patience: float = 500.0
+    unsure_m: float = 6e-4
+    unsure_rad: float = 3e-3
     speed: float = 1e-2
     torque: float = 1e-3
     acceleration: float = 1e-3
