@@ -81,13 +81,6 @@ def pull_command(card: ModelCard, folder: Path | None = None) -> str:
     return f"vid2demo models pull {card.name}{where}"
 
 
-def revision_of(card: ModelCard, folder: Path) -> str | None:
-    """The commit that lies in a folder: what `pull` noted, else the card's."""
-    receipt = folder / RECEIPT
-    noted = read_json(receipt).get("revision") if receipt.is_file() else None
-    return str(noted) if noted else card.revision
-
-
 def fingerprint(folder: Path) -> str:
     """Eight characters that tell weights apart: a hash of the configuration and of the ends of each weight file.
 
@@ -118,17 +111,16 @@ def pull(card: ModelCard, folder: Path | None = None) -> Path:
     """
     if importlib.util.find_spec("huggingface_hub") is None:
         raise UserError("fetching models needs huggingface_hub; install it with `pip install 'vid2demo[models]'`")
-    from huggingface_hub import HfApi, snapshot_download
+    from huggingface_hub import snapshot_download
     from huggingface_hub.errors import GatedRepoError
 
     target = models_folder(folder) / card.name
-    revision = revision_of(card, target)
-    if complaint(card, target) is None and (target / RECEIPT).is_file() and card.revision in (None, revision):
+    receipt = target / RECEIPT
+    if complaint(card, target) is None and receipt.is_file() and read_json(receipt).get("revision") == card.revision:
         return target
     patterns = list(FETCHED) if card.checkpoint is None else [card.checkpoint]
     try:
-        commit = card.revision or revision or HfApi().model_info(card.repository).sha
-        snapshot_download(card.repository, revision=commit, local_dir=target, allow_patterns=patterns)
+        snapshot_download(card.repository, revision=card.revision, local_dir=target, allow_patterns=patterns)
     except GatedRepoError as error:
         raise UserError(
             f"{card.repository} asks that its licence be accepted ({card.licence}): do so on its page of the hub, log "
@@ -140,13 +132,13 @@ def pull(card: ModelCard, folder: Path | None = None) -> Path:
             f"network call `vid2demo models pull {card.name} --models-dir DIR`, and copy DIR/{card.name} to {target}"
         ) from error
     if why := complaint(card, target):
-        raise UserError(f"{card.repository} at {commit} is not as expected: {target} {why}")
-    write_json(target / RECEIPT, {"repository": card.repository, "revision": commit, "licence": card.licence})
+        raise UserError(f"{card.repository} at {card.revision} is not as expected: {target} {why}")
+    write_json(receipt, {"repository": card.repository, "revision": card.revision, "licence": card.licence})
     return target
 
 
 def _hub_cache(card: ModelCard) -> Path | None:
-    """The snapshot in the hub's cache at the card's revision (its last known one where the card has none)."""
+    """The snapshot in the hub's cache at the card's revision."""
     base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     home = os.environ.get("HF_HOME") or Path(base) / "huggingface"
     cache = Path(os.environ.get("HF_HUB_CACHE") or Path(home) / "hub").expanduser()

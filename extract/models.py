@@ -18,8 +18,8 @@ Part = Literal["features", "detector", "masks", "depth", "words", "tracks"]
 class ModelCard:
     """One network on the Hugging Face hub.
 
-    part: what it does in the method.  revision: the commit that is fetched; None where none was known when this was
-    written: the first `pull` then notes the one it got beside the weights and keeps to it.  size_mb: of the weights.
+    part: what it does in the method.  revision: the commit that is fetched.  size_mb: of the weights.  licence: of the
+    weights, as their page states it; "not on their page" where only their authors' code or paper does.
     architectures: `model_type` in its config.json; what tells a right folder from a wrong one.  gated: its licence has
     to be accepted on the hub before it can be fetched.  checkpoint: the name of the weights where they are not in
     safetensors files.
@@ -28,7 +28,7 @@ class ModelCard:
     name: str
     part: Part
     repository: str
-    revision: str | None
+    revision: str
     size_mb: int
     licence: str
     used_for: str
@@ -36,10 +36,16 @@ class ModelCard:
     gated: bool = False
     checkpoint: str | None = None
 
+    @property
+    def non_commercial(self) -> bool:
+        """Whether the licence forbids commercial use."""
+        return "-NC-" in self.licence
+
 
 _CLIP, _SAM2, _DEPTH_ANYTHING = ("clip",), ("sam2_video", "sam2"), ("depth_anything",)
 _DINOV2, _DINOV3, _GROUNDING = ("dinov2_with_registers",), ("dinov3_vit",), ("grounding-dino",)
 _DINOV3_LICENCE = "DINOv3 License"
+_ELSEWHERE = "not on their page"
 
 # In each part the first is the paper's (or what comes nearest in transformers), and what is looked for first.
 _CARDS = (
@@ -85,16 +91,17 @@ _CARDS = (
         "Apache-2.0", "masks in images and videos on a CPU", _SAM2,
     ),
     ModelCard(
-        "zoedepth", "depth", "Intel/zoedepth-nyu", None, 1378, "MIT", "metric depth, as in the paper (ZoeD-N)",
-        ("zoedepth",),
+        "zoedepth", "depth", "Intel/zoedepth-nyu", "52ae69caf7896c927909b3ceab4249c235e16dc1", 1378, "MIT",
+        "metric depth, as in the paper (ZoeD-N)", ("zoedepth",),
     ),
     ModelCard(
         "depth-anything-large", "depth", "depth-anything/Depth-Anything-V2-Metric-Indoor-Large-hf",
-        "d2fc6a93601aabb1139a3bf0ebfcb4e89c67817f", 1341, "CC-BY-NC-4.0", "metric depth indoors", _DEPTH_ANYTHING,
+        "d2fc6a93601aabb1139a3bf0ebfcb4e89c67817f", 1341, f"CC-BY-NC-4.0, {_ELSEWHERE}", "metric depth indoors",
+        _DEPTH_ANYTHING,
     ),
     ModelCard(
         "depth-anything-small", "depth", "depth-anything/Depth-Anything-V2-Metric-Indoor-Small-hf",
-        "8078d68a9c75a972131914f6afd0c1723be0da7f", 99, "Apache-2.0", "metric depth indoors on a CPU",
+        "8078d68a9c75a972131914f6afd0c1723be0da7f", 99, f"Apache-2.0, {_ELSEWHERE}", "metric depth indoors on a CPU",
         _DEPTH_ANYTHING,
     ),
     ModelCard(
@@ -103,7 +110,7 @@ _CARDS = (
     ),
     ModelCard(
         "clip-large", "words", "openai/clip-vit-large-patch14", "32bd64288804d66eefd0ccbe215aa642df71cc41", 1711,
-        "MIT", "which size a crop has", _CLIP,
+        f"MIT, {_ELSEWHERE}", "which size a crop has", _CLIP,
     ),
     ModelCard(
         "siglip-large", "words", "google/siglip-so400m-patch14-384", "9fdffc58afc957d1a03a25b10dba0329ab15c2a3", 3513,
@@ -114,7 +121,7 @@ _CARDS = (
         "Apache-2.0", "which size a crop has, on a CPU", ("siglip",),
     ),
     ModelCard(
-        "cotracker", "tracks", "facebook/cotracker3", None, 102, "CC-BY-NC-4.0",
+        "cotracker", "tracks", "facebook/cotracker3", "b748ec5e5cd4b9f525a94cc544f0be34bbcc22e2", 102, "CC-BY-NC-4.0",
         "points through a video; needs the authors' package `cotracker` as well", (), checkpoint="scaled_offline.pth",
     ),
 )  # fmt: skip

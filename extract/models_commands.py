@@ -36,6 +36,7 @@ class ModelsList(Command):
                 "part": card.part,
                 "size_mb": card.size_mb,
                 "licence": card.licence,
+                "non_commercial": card.non_commercial,
                 "used_for": card.used_for,
                 "repository": card.repository,
                 "revision": card.revision,
@@ -48,7 +49,8 @@ class ModelsList(Command):
         rows = [("name", "part", "MB", "licence", "here", "used for")]
         for name, row in result["models"].items():
             here = "yes" if row["folder"] else "no"
-            rows.append((name, row["part"], str(row["size_mb"]), row["licence"], here, row["used_for"]))
+            licence = row["licence"] + (" (non-commercial)" if row["non_commercial"] else "")
+            rows.append((name, row["part"], str(row["size_mb"]), licence, here, row["used_for"]))
         widths = [max(len(row[k]) for row in rows) for k in range(5)]
         lines = ["  ".join([*(cell.ljust(w) for cell, w in zip(row, widths, strict=False)), row[5]]) for row in rows]
         return "\n".join([*lines, f"kept in {result['folder']}; fetch one with `vid2demo models pull NAME`"])
@@ -65,7 +67,7 @@ class ModelsPull(Command):
     models_dir: ModelsDir = None
 
     def do(self) -> Result:
-        from .model_folder import pull, revision_of
+        from .model_folder import pull
         from .models import model_card
 
         card = model_card(self.name)
@@ -73,7 +75,7 @@ class ModelsPull(Command):
         return {
             "model": card.name,
             "folder": str(folder),
-            "revision": revision_of(card, folder),
+            "revision": card.revision,
             "licence": card.licence,
         }
 

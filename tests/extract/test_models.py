@@ -19,6 +19,7 @@ from vid2demo.extract.choose import NEEDED, choose
 from vid2demo.extract.errors import UserError
 from vid2demo.extract.model_folder import FOLDER_VARIABLE, RECEIPT, find_folder, models_folder, require_folder
 from vid2demo.extract.models import MODELS, cards_for, model_card
+from vid2demo.extract.models_commands import ModelsList
 from vid2demo.extract.neural_tracks import NeuralTracks
 
 COMMIT = "0d9846e56b43a21fa46d7f3f5070f0506a5795a9"  # of dinov2-small
@@ -35,13 +36,20 @@ def test_every_card_is_complete() -> None:
     assert len({card.repository for card in MODELS.values()}) == len(MODELS)
     for card in MODELS.values():
         assert re.fullmatch(r"[\w.-]+/[\w.-]+", card.repository)
-        assert card.revision is None or re.fullmatch(r"[0-9a-f]{40}", card.revision)
+        assert re.fullmatch(r"[0-9a-f]{40}", card.revision)
         assert card.size_mb > 50
         assert card.licence
         assert card.architectures or card.checkpoint
-    revisions = [card.revision for card in MODELS.values() if card.revision]
-    assert len(set(revisions)) == len(revisions)
+    assert len({card.revision for card in MODELS.values()}) == len(MODELS)
     assert {part for parts in NEEDED.values() for part in parts} == {card.part for card in MODELS.values()}
+
+
+def test_the_list_says_which_licences_forbid_commercial_use(tmp_path: Path) -> None:
+    command = ModelsList(models_dir=tmp_path)
+    lines = command.words(command.do()).splitlines()
+    told = {line.split()[0] for line in lines if "(non-commercial)" in line}
+    assert told == {"depth-anything-large", "cotracker"}
+    assert any(line.startswith("clip-large") and "MIT, not on their page" in line for line in lines)
 
 
 def test_first_choice_of_each_part_is_the_papers() -> None:
