@@ -2,17 +2,20 @@
 
     OMP_NUM_THREADS=1 MUJOCO_GL=egl python bench/retrieval.py DATASET [--db DB] [--json]
     OMP_NUM_THREADS=1 python bench/retrieval.py --cost [--objects 50000] [--json]
+    OMP_NUM_THREADS=1 python bench/retrieval.py --onboarding [--objects 24] [--views 600] [--json]
 
 DATASET is what `vid2demo synthesize bop` writes: its pictures show variants that its database does not hold. Objects
-are given by their visible masks. The database is made in DATASET/views when --db is not given. Beside the descriptors
-stand a blind guess and the moments of the silhouette alone. `--cost` fabricates a database of 50,000 objects of 600
-views (sparse files) and times opening and searching it.
+are given by their visible masks. Without DATASET it is rendered to runs/tables first. The database is made in
+DATASET/views when --db is not given. Beside the descriptors stand a blind guess and the moments of the silhouette.
+`--cost` fabricates a database of 50,000 objects of 600 views (sparse files) and times opening and searching it.
+`--onboarding` times the library's vessels by one worker and by two.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import resource
 import subprocess
 import sys
 import tempfile
@@ -26,9 +29,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from vid2demo.extract.bop import open_dataset
+from vid2demo.extract.bop_commands import SynthesizeBop
 from vid2demo.extract.bop_pose import large_enough
 from vid2demo.extract.features import ClassicalFeatures, features_of
-from vid2demo.extract.mesh_sources import find_sources
+from vid2demo.extract.mesh_sources import find_sources, library_sources
 from vid2demo.extract.mesh_store import About, MeshStore
 from vid2demo.extract.onboarding import onboard
 from vid2demo.extract.protocols import Image, Mask, Proposal
@@ -36,6 +40,7 @@ from vid2demo.extract.retrieval import Look, Retriever, look_at_object, vote
 from vid2demo.extract.segment import mask_box
 from vid2demo.extract.templates import ViewSettings, template_view
 
+DATASET = Path("runs/tables")
 CLEAR = 0.95  # visible share from which on an object counts as unhidden
 SEARCHES = 15
 MOMENT_STEP = 3  # a third of the views serves moments as well, which know no turn of the picture
@@ -202,6 +207,25 @@ def cost(objects: int, size: int = 1024) -> dict[str, Any]:
         }
 
 
+def onboarding(meshes: int, views: int) -> dict[str, float]:
+    """What a mesh costs, by one worker and by two: time on the clock, and of all processors, start-up included."""
+    sources = library_sources(1 + meshes // 23)[:meshes]
+    found: dict[str, float] = {"meshes": len(sources), "views": views}
+    for workers in (1, 2):
+        with tempfile.TemporaryDirectory() as folder:
+            begin_s, used_s = time.perf_counter(), processor_s()
+            onboard(sources, Path(folder) / "db", settings=ViewSettings(count=views), workers=workers)
+            found[f"clock_s_{workers}"] = (time.perf_counter() - begin_s) / meshes
+            found[f"processor_s_{workers}"] = (processor_s() - used_s) / meshes
+    return found
+
+
+def processor_s() -> float:
+    """Processor time of this process and its ended children."""
+    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(u.ru_utime + u.ru_stime for u in used)
+
+
 def as_text(found: dict[str, Any]) -> str:
     if "rows" not in found:
         return "\n".join(f"{name:<22} {value:10.2f}" for name, value in found.items())
@@ -221,16 +245,23 @@ def main() -> None:
     parser.add_argument("dataset", type=Path, nargs="?")
     parser.add_argument("--db", type=Path)
     parser.add_argument("--cost", action="store_true")
-    parser.add_argument("--objects", type=int, default=50_000)
+    parser.add_argument("--onboarding", action="store_true")
+    parser.add_argument("--objects", type=int, help="of --cost: 50000; of --onboarding: 24")
+    parser.add_argument("--views", type=int, default=600)
     parser.add_argument("--opening", type=Path, help=argparse.SUPPRESS)
     parser.add_argument("--json", action="store_true")
     chosen = parser.parse_args()
     if chosen.opening:
         print(json.dumps(opening(chosen.opening)))
         return
-    if not chosen.cost and chosen.dataset is None:
-        parser.error("name a data set that `vid2demo synthesize bop` made, or give --cost")
-    found = cost(chosen.objects) if chosen.cost else accuracy(chosen.dataset, chosen.db)
+    if chosen.cost:
+        found = cost(chosen.objects or 50_000)
+    elif chosen.onboarding:
+        found = onboarding(chosen.objects or 24, chosen.views)
+    else:
+        if chosen.dataset is None:
+            SynthesizeBop(out=DATASET).do()
+        found = accuracy(chosen.dataset or DATASET, chosen.db)
     print(json.dumps(found, indent=2) if chosen.json else as_text(found))
 
 
