@@ -36,6 +36,9 @@ class Retarget(Staged):
     ] = None
     scale: Scale = "auto"
     speed: Annotated[float, arg(metavar="FLOAT", help="Robot's speed over the video's, at most [ratio].")] = 1.0
+    elevation: Annotated[
+        float, arg(metavar="DEG", help="How far the camera looks down, unless something upright tells it [deg].")
+    ] = 30.0
     solver: SolverName = "auto"
     seed: Seed = 0
 
@@ -46,6 +49,7 @@ class Retarget(Staged):
             "receptacle": self.receptacle,
             "scale": self.scale,
             "speed": self.speed,
+            "elevation_deg": self.elevation,
             "seed": self.seed,
         }
         first = reference_stage(self.track, self.receptacle_track, self.out, **chosen)
@@ -65,14 +69,18 @@ class Simulate(Staged):
     joints: Annotated[Path | None, told("FILE", "The *.joints.npz to play. Default: the one beside the reference.")] = (
         None
     )
+    grasp: Annotated[
+        Literal["weld", "friction"], arg(help="The vessel is a part of the hand, or held by the fingers' friction.")
+    ] = "weld"
     video: Annotated[Path | None, told("VIDEO", "The clip to show beside the robot. Default: the robot alone.")] = None
 
     def do(self) -> Result:
         from .steps import joints_path, simulate_stage
 
         joints = self.joints or joints_path(self.reference, self.reference.parent)
-        stage = simulate_stage(self.reference, joints, self.video, self.out)
-        return self.do_stages([stage], {"reference": self.reference, "joints": joints, "video": self.video})
+        stage = simulate_stage(self.reference, joints, self.video, self.out, grasp=self.grasp)
+        chosen = {"reference": self.reference, "joints": joints, "video": self.video, "grasp": self.grasp}
+        return self.do_stages([stage], chosen)
 
 
 @dataclass(frozen=True, kw_only=True)

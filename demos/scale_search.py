@@ -115,6 +115,8 @@ def _changes(tries: list[Try], scale: float) -> Iterator[Change]:
         best = _best(tries)
         if best.score < ENOUGH and best.poured + best.spilled < ENOUGH:
             yield replace(best.change, tip_deg=tip_deg)
+            if _best(tries) is best:
+                break
 
 
 def _attempt(reference: Reference, change: Change, *, faithful: bool) -> Try:

@@ -23,6 +23,8 @@ from .rollout import DEFAULT_ENV_ID, Info, Observation, control_rate, make_env, 
 Image = NDArray[np.uint8]
 PANEL_HEIGHT_PX = 480
 STRIP_HEIGHT_PX = 40
+# Told by environments in which friction holds the vessel: how far it has moved and turned in the hand.
+_SLIP = ("slip_m", "slip_rad")
 _BACKGROUND, _EMPTY = (24, 26, 30), (60, 64, 72)
 _TEXT, _POURED, _SPILLED = (236, 238, 242), (74, 163, 255), (255, 107, 87)
 
@@ -45,7 +47,7 @@ def simulate(
     so the two stay together where the motion was slowed down. Without a video the robot stands alone.
     Returns figures (JSON-like) and `series`: lists over the steps, with `time_s`, `position_error_m`,
     `rotation_error_rad`, `tilt_rad`, `reference_tilt_rad`, `poured_fraction`, `spilled_fraction`, `q_rad` (N x 7),
-    `target_rad` (N x 7), `reward` and `reward_terms` (name to list).
+    `target_rad` (N x 7), `reward` and `reward_terms` (name to list), and under friction `slip_m` and `slip_rad`.
     Raises UserError when the files do not belong together.
     """
     reference, joints = Reference.load(Path(reference_path)), JointTrajectory.load(Path(joints_path))
@@ -74,6 +76,7 @@ def simulate(
         "position_error_m": {"mean": float(position_m.mean()), "max": float(position_m.max())},
         "rotation_error_rad": {"mean": float(rotation_rad.mean()), "max": float(rotation_rad.max())},
         "largest_tilt_rad": float(np.max(series["tilt_rad"])),
+        **{name: float(np.max(series[name])) for name in _SLIP if name in series},
         "duration_s": float(series["time_s"][-1]),
         "steps": len(episode),
         "return": episode.summary["return"],
@@ -111,7 +114,8 @@ class _Recorder:
             "reward": reward,
             **{
                 name: float(info[name])
-                for name in ("position_error_m", "rotation_error_rad", "poured_fraction", "spilled_fraction")
+                for name in ("position_error_m", "rotation_error_rad", "poured_fraction", "spilled_fraction", *_SLIP)
+                if name in info
             },
         }
         for name, value in values.items():

@@ -35,12 +35,13 @@ def reference_stage(
     receptacle: str | None = None,
     scale: float | Literal["auto"] = "auto",
     speed: float = 1.0,
+    elevation_deg: float = 30.0,
     seed: int = 0,
 ) -> Stage:
     """NAME.track.npz (and the receptacle's) -> NAME.reference.npz. receptacle: a library vessel to stand there.
 
     scale: "auto" takes what pours best in the simulator, if the faithful motion does not pour well.
-    speed: of the motion over the video's.
+    speed: of the motion over the video's. elevation_deg: how far the camera looks down, where nothing upright tells.
     """
     output = reference_path(track, folder)
 
@@ -55,7 +56,8 @@ def reference_stage(
         moved = ObjectTrack.load(track)
 
         def build(wanted: float | Literal["auto"]) -> Reference:
-            return build_reference(moved, seen, scale=wanted, speed=speed, receptacle=vessel, seed=seed)
+            chosen: dict[str, Any] = {"scale": wanted, "speed": speed, "elevation_deg": elevation_deg, "seed": seed}
+            return build_reference(moved, seen, receptacle=vessel, **chosen)
 
         reference = build(scale)
         if scale == "auto":
@@ -72,7 +74,7 @@ def reference_stage(
         "reference",
         "place the motion in the robot's workspace",
         work,
-        {"scale": scale, "speed": speed, "seed": seed, "receptacle": receptacle},
+        {"scale": scale, "speed": speed, "elevation_deg": elevation_deg, "seed": seed, "receptacle": receptacle},
         {"track": track} | ({"receptacle track": receptacle_track} if receptacle_track else {}),
         (output.name,),
         ROOMS,
@@ -111,13 +113,16 @@ def retarget_stage(reference: Path, folder: Path, *, solver: Literal["auto", "to
     )
 
 
-def simulate_stage(reference: Path, joints: Path, video: Path | None, folder: Path) -> Stage:
-    """Reference and joints (and the video) -> simulation.mp4 and series.json."""
+def simulate_stage(
+    reference: Path, joints: Path, video: Path | None, folder: Path, *, grasp: Literal["weld", "friction"] = "weld"
+) -> Stage:
+    """Reference and joints (and the video) -> simulation.mp4 and series.json. grasp: how the hand holds the vessel."""
 
     def work(progress: Progress) -> Mapping[str, Any]:
         from .simulate import simulate
 
-        result = plain(simulate(reference, joints, video, folder / "simulation.mp4", progress=progress))
+        film, how = folder / "simulation.mp4", {"grasp": grasp}
+        result = plain(simulate(reference, joints, video, film, env_kwargs=how, progress=progress))
         write_json(folder / "series.json", result["series"])
         return {name: value for name, value in result.items() if name != "series"}
 
@@ -125,7 +130,7 @@ def simulate_stage(reference: Path, joints: Path, video: Path | None, folder: Pa
         "simulate",
         "let the robot pour",
         work,
-        {},
+        {"grasp": grasp},
         {"reference": reference, "joints": joints} | ({"video": video} if video else {}),
         ("simulation.mp4", "series.json"),
         ROOMS,

@@ -94,9 +94,15 @@ def test_clock_stops_at_the_end_of_the_video(video: Path) -> None:
     np.testing.assert_allclose(shown, [gray_of(0)] + [gray_of(69)] * 4, atol=2)
 
 
-def test_without_a_video_the_robot_stands_alone(files: tuple[Path, Path], tmp_path: Path) -> None:
-    simulate(*files, None, tmp_path / "alone.mp4", **FAST)
+def test_without_a_video_the_robot_stands_alone_and_friction_tells_of_slip(
+    files: tuple[Path, Path], result: dict[str, Any], tmp_path: Path
+) -> None:
+    held = simulate(*files, None, tmp_path / "alone.mp4", env_kwargs={"num_particles": 20, "grasp": "friction"})
     assert read_video_info(tmp_path / "alone.mp4").width_px == PANEL_HEIGHT_PX * 4 // 3
+    assert 0.0 < held["slip_m"] == max(held["series"]["slip_m"]) < 0.005
+    assert 0.0 < held["slip_rad"] < np.deg2rad(3)
+    assert held["position_error_m"]["max"] < 0.005
+    assert "slip_m" not in result
 
 
 def test_files_of_two_motions_are_refused(files: tuple[Path, Path], tmp_path: Path) -> None:
