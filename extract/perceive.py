@@ -6,7 +6,7 @@ Find every object in the start frame, fit its mesh and pose there, follow it thr
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,6 +22,7 @@ from .candidates import candidate_models as candidate_models
 from .detect import find_object, motion_since
 from .errors import UserError
 from .files import atomic_path
+from .focal import focal_of_clip, scaled_focal
 from .follow import Followed
 from .geometry import Array, focal_prior_camera_matrix
 from .masks import read_mask, write_masks
@@ -36,6 +37,7 @@ from .video import Image, VideoInfo, iterate_frames, read_video_info, sample_fra
 
 TRUSTED_CONFIDENCE = 0.6  # mean over the clip, of an object that nobody pointed at
 SURE_OF_CAMERA = 0.5  # median share of the background that agrees on how the camera turned
+LESS_SURE = 0.05  # of confidence, that a focal length told by the clip may cost: noise, if it is right
 SEEN_SHARE = 0.1  # of the clip, least
 OTHER_FRAMES = (45,)  # looked at when what was found in the first cannot be followed surely
 
@@ -57,8 +59,10 @@ class _Scene:
 
 @dataclass(frozen=True)
 class _Attempt:
-    """The objects as they were found in one frame and followed from there."""
+    """The objects as they were found in one frame, `sharp`, and followed from there."""
 
+    scene: _Scene
+    sharp: Image
     index: int
     starts: list[Start]
     followed: list[Followed]
@@ -86,7 +90,8 @@ def extract(
 
     Writes `NAME.track.npz`, `NAME.masks.npz`, `NAME.mask.png` (start frame) and `overlay.mp4`; and `extract.rrd` when
     `rerun` is true.
-    camera: fx, fy, cx, cy in px; the focal prior f = sqrt(w^2 + h^2) when None.  The first request is the handled
+    camera: fx, fy, cx, cy in px; when None the focal prior f = sqrt(w^2 + h^2), or what a mesh of the handled
+    object's own tells (focal.py) where that is sure.  The first request is the handled
     object, the others are receptacles.  start_frame: what boxes and masks belong to; when None the first, or another
     that shows the objects better where nobody pointed at them.  camera_motion: "static" does not look whether the
     camera moves; "moving" takes it to turn even where that explains only a part of what is seen.
@@ -115,15 +120,15 @@ def extract(
     scene = _Scene(info, camera_matrix, start_scale, scale, samples, background)
     attempts: list[_Attempt] = []
     for index, sharp, starts in _found(scene, requests, models, start_frame):
-        clip = Clip(info, index, _small(sharp, scene), scene.camera(scene.scale), scene.background)
-        starts = [sharpened(start, sharp, scene.camera(scene.start_scale)) for start in settle_rivals(clip, starts)]
-        followed, watched = follow_both_ways(clip, starts, report, watch_camera=camera_motion != "static")
-        attempts.append(_Attempt(index, starts, followed, watched))
+        attempts.append(_attempt(scene, index, sharp, starts, report, camera_motion != "static"))
         if starts[0].box_source != "found" or attempts[-1].sure >= TRUSTED_CONFIDENCE:
             break
         report(0, info.frame_count, f"looking again for {requests[0].name}, in another frame")
     best = max(attempts, key=lambda attempt: attempt.sure)
-    index, starts, followed, watched = best.index, best.starts, best.followed, best.watched
+    camera_told: dict[str, Any] = {"source": camera_source}
+    if camera is None and requests[0].mesh is not None:
+        best, camera_told = _with_told_focal(best, requests, models, report, camera_motion != "static")
+    scene, index, starts, followed, watched = best.scene, best.index, best.starts, best.followed, best.watched
     time_s = np.array([watched.times[k] for k in sorted(watched.times)])
     R_first_camera, motion_words = _camera_turns(watched.camera, camera_motion)
 
@@ -136,11 +141,11 @@ def extract(
         model = start.best.model if result.vessel is None else vessel_model(result.vessel)
         smooth = smooth_poses(raw, time_s, confidence * visible)
         header = _header(request, scene, start, model, index)
-        header["camera"] = {"source": camera_source, "motion": motion_words}
+        header["camera"] = {**camera_told, "motion": motion_words}
         header["video"]["cuts"] = [{"frame": c.index, "time_s": round(c.time_s, 4)} for c in watched.cuts.cuts]
         header["settings"] |= {"spin_source": result.spin_source, "seed": seed}
         tracks[request.name] = ObjectTrack(
-            smooth, time_s, camera_matrix, confidence, visible, header, R_first_camera, raw
+            smooth, time_s, scene.camera_matrix, confidence, visible, header, R_first_camera, raw
         )
 
     items = [OverlayItem(track, f.mesh) for track, f in zip(tracks.values(), followed, strict=True)]
@@ -163,6 +168,51 @@ def write_tracks(
     write_overlay(info.path, items, out / "overlay.mp4")
     if rerun:
         write_rerun(info.path, items, out / "extract.rrd")
+
+
+def _attempt(
+    scene: _Scene, index: int, sharp: Image, starts: list[Start], report: Progress, watch_camera: bool
+) -> _Attempt:
+    clip = Clip(scene.info, index, _small(sharp, scene), scene.camera(scene.scale), scene.background)
+    starts = [sharpened(start, sharp, scene.camera(scene.start_scale)) for start in settle_rivals(clip, starts)]
+    followed, watched = follow_both_ways(clip, starts, report, watch_camera=watch_camera)
+    return _Attempt(scene, sharp, index, starts, followed, watched)
+
+
+def _with_told_focal(
+    first: _Attempt,
+    requests: Sequence[ObjectRequest],
+    models: Sequence[list[Model]],
+    report: Progress,
+    watch_camera: bool,
+) -> tuple[_Attempt, dict[str, Any]]:
+    """The objects followed again with the focal length that the handled one tells, and what the header says of it.
+
+    As they were, with the prior, where it tells none, is unsure or in favour of the prior, or says something else when
+    asked a second time.
+    """
+    scene, prior_px = first.scene, float(first.scene.camera_matrix[0, 0])
+    told = focal_of_clip(scene.info, first.followed[0], WORKING_SIDE_PX)
+    if told is None:
+        return first, {"source": "prior"}
+    said = {"told_focal_px": round(prior_px * told.factor, 1), "told_std_px": round(prior_px * told.std, 1)}
+    refused = first, {"source": "prior", **said}
+    if not (told.trusted(told.factor) and told.contradicts):
+        return refused
+    report(0, scene.info.frame_count, "following again, with the focal length that the clip tells")
+    scene = replace(scene, camera_matrix=scaled_focal(scene.camera_matrix, told.factor))
+    try:
+        starts = _find_in(first.sharp, scene, requests, models)
+    except NotFoundError:
+        return refused
+    second = _attempt(scene, first.index, first.sharp, starts, report, watch_camera)
+    again = focal_of_clip(scene.info, second.followed[0], WORKING_SIDE_PX, told.factor)
+    if again is None or not told.agree(again) or second.sure < first.sure - LESS_SURE:
+        return refused
+    focal_px = float(scene.camera_matrix[0, 0])
+    # What it would still change is as uncertain as what it is sure of.
+    std_px = focal_px * float(np.hypot(again.log_std, np.log(again.factor)))
+    return second, {"source": "estimated", "focal_px": round(focal_px, 1), "std_px": round(std_px, 1)}
 
 
 def _camera_turns(watch: CameraWatch | None, asked: str) -> tuple[Array | None, dict[str, Any]]:

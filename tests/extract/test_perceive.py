@@ -22,6 +22,7 @@ from vid2demo.extract.video import VideoWriter, iterate_backward, iterate_frames
 
 WIDTH, HEIGHT, COUNT = 320, 240, 10
 K = focal_prior_camera_matrix(WIDTH, HEIGHT)
+CAMERA = (float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
 rng = np.random.default_rng(0)
 GROUND = cv2.GaussianBlur(rng.normal((90, 120, 150), 40, (HEIGHT, WIDTH, 3)), (0, 0), 2.0)
 OTHER = cv2.GaussianBlur(rng.normal((150, 140, 60), 40, (HEIGHT, WIDTH, 3)), (0, 0), 4.0)
@@ -83,7 +84,7 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def follow(video: Path, mesh: Path, out: Path, start: int = 0, **options) -> ObjectTrack:
     request = ObjectRequest("wedge", box_at(start), mesh, "m")
-    return extract(video, [request], out=out, start_frame=start, **options)["wedge"]
+    return extract(video, [request], out=out, start_frame=start, camera=CAMERA, **options)["wedge"]
 
 
 def off_px(track: ObjectTrack, frames: range | list[int]) -> float:
@@ -110,7 +111,7 @@ def test_a_mask_says_where_the_object_is(clip: Path, mesh_file: Path, tmp_path: 
     file = tmp_path / "mask.png"
     cv2.imwrite(str(file), silhouette(3).astype(np.uint8) * 255)
     request = ObjectRequest("wedge", None, mesh_file, "m", file)
-    track = extract(clip, [request], out=tmp_path / "out", start_frame=3)["wedge"]
+    track = extract(clip, [request], out=tmp_path / "out", start_frame=3, camera=CAMERA)["wedge"]
     assert off_px(track, range(COUNT)) < 4
     assert track.header["settings"]["box_source"] == "mask"
 
@@ -267,7 +268,9 @@ def test_large_and_deep_videos_are_followed(kind: str, mesh_file: Path, tmp_path
             container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
         container.mux(stream.encode(None))
     x, y, w, h = (v * factor for v in box_at(0))
-    track = extract(video, [ObjectRequest("wedge", (x, y, w, h), mesh_file, "m")], out=tmp_path / "out")["wedge"]
+    fx, fy, cx, cy = (v * factor for v in CAMERA)
+    request = ObjectRequest("wedge", (x, y, w, h), mesh_file, "m")
+    track = extract(video, [request], out=tmp_path / "out", camera=(fx, fy, cx, cy))["wedge"]
     assert track.header["image_size_px"] == [WIDTH * factor, HEIGHT * factor]
     scaled = np.diag([factor, factor, 1.0]) @ K
     for k in range(4):
