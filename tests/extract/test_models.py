@@ -13,6 +13,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import ClassVar
 
+import numpy as np
 import pytest
 from vid2demo.cli import main
 from vid2demo.extract.choose import NEEDED, choose
@@ -21,6 +22,7 @@ from vid2demo.extract.model_folder import FOLDER_VARIABLE, RECEIPT, find_folder,
 from vid2demo.extract.models import MODELS, cards_for, model_card
 from vid2demo.extract.models_commands import ModelsList
 from vid2demo.extract.neural_tracks import NeuralTracks
+from vid2demo.extract.protocols import PointTracker
 
 COMMIT = "0d9846e56b43a21fa46d7f3f5070f0506a5795a9"  # of dinov2-small
 
@@ -271,6 +273,55 @@ def test_tracks_without_their_package_say_what_to_install(tmp_path: Path, monkey
     monkeypatch.setattr("importlib.util.find_spec", _without_cotracker)
     with pytest.raises(UserError, match="cotracker is not installed"):
         NeuralTracks(models_dir=tmp_path, device="cpu")
+
+
+PREDICTOR = """
+import torch
+
+class CoTrackerPredictor(torch.nn.Module):
+    def __init__(self, checkpoint, offline, window_len):
+        super().__init__()
+        assert checkpoint is None and offline
+        self.interp_shape = (24, 32)
+        self.model = torch.nn.Linear(1, 1)
+
+    def forward(self, video, queries, backward_tracking):
+        assert backward_tracking and video.shape[3:] == self.interp_shape
+        frame, at = queries[..., 0], queries[..., 1:]
+        moved = torch.arange(video.shape[1])[None, :, None] - frame[:, None]
+        tracks = at[:, None] + moved[..., None] * torch.tensor([1.0, 0.5])
+        return tracks, moved < 2
+"""
+
+
+@pytest.mark.slow
+def test_points_are_given_to_cotracker_at_its_own_size_and_brought_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The package cannot be had here: a stand-in with its interface, where torch.hub keeps it, moves every point."""
+    import torch
+
+    package = tmp_path / "hub/hub/facebookresearch_co-tracker_main/cotracker"
+    package.mkdir(parents=True)
+    (package / "__init__.py").touch()
+    (package / "predictor.py").write_text(PREDICTOR)
+    (tmp_path / "cotracker").mkdir()
+    torch.save({"model": torch.nn.Linear(1, 1).state_dict()}, tmp_path / "cotracker/scaled_offline.pth")
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "hub"))
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    tracker = NeuralTracks(models_dir=tmp_path, device="cpu")
+    assert isinstance(tracker, PointTracker)
+    assert tracker.name == "cotracker3-offline"
+    frames = np.zeros((4, 47, 94, 3), np.uint8)  # 46 and 93 steps between pixels; the network has 23 and 31
+    points = np.array([[30.0, 20.0], [60.0, 10.0]], np.float32)
+    found = tracker.track(frames, np.array([0, 2]), points)
+    for k, (first, second) in enumerate(zip(found.pixels_px[:, 0], found.pixels_px[:, 1], strict=True)):
+        np.testing.assert_allclose(first, [30 + 3 * k, 20 + k], atol=1e-4)
+        np.testing.assert_allclose(second, [60 + 3 * (k - 2), 10 + (k - 2)], atol=1e-4)
+    np.testing.assert_array_equal(found.visible[:, 0], [True, True, False, False])
+    assert tracker.track(frames, np.zeros(0, np.int64), points[:0]).pixels_px.shape == (4, 0, 2)
+    for name in ("cotracker", "cotracker.predictor"):
+        del sys.modules[name]
 
 
 def _without_cotracker(name: str) -> object | None:
