@@ -186,15 +186,19 @@ def silhouette_ious(
     window = render_depth(mesh.vertices_m, mesh.faces, T_camera_object, camera_matrix)
     if window is None:
         return 0.0, 0.0
-    silhouette = window.mask_in_image(mask.shape[1], mask.shape[0])
+    silhouette, place = window.part_in_image(mask.shape[1], mask.shape[0])
     if not silhouette.any():
         return 0.0, 0.0
-    shared, either = silhouette & mask, silhouette | mask
-    if trust is None:
-        iou = np.count_nonzero(shared) / np.count_nonzero(either)
-    else:
-        iou = float(trust[shared].sum()) / max(float(trust[either].sum()), 1.0)
-    return float(iou), _box_iou(mask_box(silhouette), box_xywh_px)
+
+    def amount(pixels: NDArray[np.bool_], where: tuple[slice, slice]) -> float:
+        return float(np.count_nonzero(pixels) if trust is None else trust[where][pixels].sum())
+
+    here = mask[place]
+    shared = amount(silhouette & here, place)
+    either = amount(mask, np.s_[:, :]) + amount(silhouette & ~here, place)
+    x, y, width, height = mask_box(silhouette)
+    box = (x + place[1].start, y + place[0].start, width, height)
+    return shared / max(either, 1.0), _box_iou(box, box_xywh_px)
 
 
 def _box_iou(a: Box, b: Box) -> float:
@@ -258,15 +262,15 @@ def _with_few_faces(mesh: TrackingMesh) -> TrackingMesh:
 def _placed(mesh: TrackingMesh, R: Array, camera_matrix: Array, box: Box) -> Array:
     """The pose with rotation R whose projection has the box's size and centre (FreePose, eq. 2)."""
     target = np.array([box[0] + box[2] / 2, box[1] + box[3] / 2])
-    inverse = np.linalg.inv(camera_matrix)
-    depth, aim = 10.0 * mesh.radius_m, target.copy()
+    inverse, radius_m = np.linalg.inv(camera_matrix), mesh.radius_m
+    depth, aim = 10.0 * radius_m, target.copy()
     for _ in range(3):
         T = make_pose(R, inverse @ np.array([*aim, 1.0]) * depth)
         points = transform_points(T, mesh.vertices_m)
         pixels = (points @ camera_matrix.T)[:, :2] / np.maximum(points[:, 2:], 1e-6)
         low, high = pixels.min(axis=0), pixels.max(axis=0)
         depth *= float(np.sqrt(np.prod(high - low) / (box[2] * box[3])))
-        depth = max(depth, 1.2 * mesh.radius_m)
+        depth = max(depth, 1.2 * radius_m)
         aim += target - (low + high) / 2
     return make_pose(R, inverse @ np.array([*aim, 1.0]) * depth)
 

@@ -39,14 +39,22 @@ class DepthWindow:
     def depth_in_image(self, width_px: int, height_px: int) -> NDArray[np.float32]:
         """The depth in m cut to the image, (height, width) float32, 0 where nothing was hit."""
         full = np.zeros((height_px, width_px), np.float32)
+        inner, place = self._cut(width_px, height_px)
+        full[place] = self.depth_m[inner]
+        return full
+
+    def part_in_image(self, width_px: int, height_px: int) -> tuple[NDArray[np.bool_], tuple[slice, slice]]:
+        """The silhouette in the part of the image that the window covers, and that part's rows and columns."""
+        inner, place = self._cut(width_px, height_px)
+        return np.asarray(self.depth_m[inner] > 0), place
+
+    def _cut(self, width_px: int, height_px: int) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
+        """Rows and columns that window and image share, in the window and in the image; empty if they share none."""
         h, w = self.depth_m.shape
         x_a, y_a = max(self.x0_px, 0), max(self.y0_px, 0)
-        x_b, y_b = min(self.x0_px + w, width_px), min(self.y0_px + h, height_px)
-        if x_a < x_b and y_a < y_b:
-            full[y_a:y_b, x_a:x_b] = self.depth_m[
-                y_a - self.y0_px : y_b - self.y0_px, x_a - self.x0_px : x_b - self.x0_px
-            ]
-        return full
+        x_b, y_b = max(min(self.x0_px + w, width_px), x_a), max(min(self.y0_px + h, height_px), y_a)
+        inner = slice(y_a - self.y0_px, y_b - self.y0_px), slice(x_a - self.x0_px, x_b - self.x0_px)
+        return inner, (slice(y_a, y_b), slice(x_a, x_b))
 
 
 def render_depth(

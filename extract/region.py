@@ -9,6 +9,7 @@ around points of the mesh, so that a mirror-bright or many-coloured object still
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -60,7 +61,7 @@ class TrackingMesh:
         centres = farthest_points(vertices, LOCAL_CENTRES)
         return TrackingMesh(vertices, np.ascontiguousarray(faces, np.int32), centres, cKDTree(centres))
 
-    @property
+    @cached_property
     def radius_m(self) -> float:
         return float(np.linalg.norm(self.vertices_m, axis=1).max())
 

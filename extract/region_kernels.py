@@ -53,11 +53,13 @@ def count_bins(lab: NDArray[np.uint8], bits: int, chroma_step: int, bins: NDArra
     where they are vivid.
     """
     shift, side = 8 - bits, 1 << bits
+    light, chroma = np.empty(256, np.int32), np.empty(256, np.int32)
+    for value in range(256):
+        light[value] = (value >> shift) << (2 * bits)
+        chroma[value] = min(max((value - 128) // chroma_step + side // 2, 0), side - 1)
     for y in range(lab.shape[0]):
         for x in range(lab.shape[1]):
-            a = min(max((int(lab[y, x, 1]) - 128) // chroma_step + side // 2, 0), side - 1)
-            b = min(max((int(lab[y, x, 2]) - 128) // chroma_step + side // 2, 0), side - 1)
-            bins[y, x] = ((int(lab[y, x, 0]) >> shift) << (2 * bits)) | (a << bits) | b
+            bins[y, x] = light[lab[y, x, 0]] + chroma[lab[y, x, 1]] * side + chroma[lab[y, x, 2]]
 
 
 @numba.njit(cache=True)
@@ -82,20 +84,29 @@ def strongest_gradient(rgb: NDArray[np.uint8], scale: float, out: NDArray[np.flo
 @numba.njit(cache=True)
 def smooth_histogram(histogram: NDArray[np.float32], side: int) -> None:
     """Normalise a histogram of side^3 bins, spread over neighbouring bins so that small samples do not overfit."""
+    # Only the box of bins that are taken or next to one that is: few colours are near each other.
+    low, high, strides = np.full(3, side), np.full(3, 0), (1, side, side * side)
+    for at in range(side**3):
+        if histogram[at] > 0.0:
+            for axis in range(3):
+                k = at // strides[axis] % side
+                low[axis], high[axis] = min(low[axis], max(k - 1, 0)), max(high[axis], min(k + 2, side))
+    for axis in range(3):
+        one, other, stride = (axis + 1) % 3, (axis + 2) % 3, strides[axis]
+        for i in range(low[one], high[one]):
+            for j in range(low[other], high[other]):
+                before = np.float32(0.0)
+                for k in range(low[axis], high[axis]):
+                    at = i * strides[one] + j * strides[other] + k * stride
+                    here = histogram[at]
+                    after = histogram[at + stride] if k + 1 < side else np.float32(0.0)
+                    histogram[at] = np.float32(0.5) * here + np.float32(0.25) * (before + after)
+                    before = here
     total = np.float32(0.0)
-    for stride in (1, side, side * side):
-        for start in range(side**3):
-            if (start // stride) % side:
-                continue
-            before = np.float32(0.0)
-            for k in range(side):
-                at = start + k * stride
-                here = histogram[at]
-                after = histogram[at + stride] if k + 1 < side else np.float32(0.0)
-                histogram[at] = np.float32(0.5) * here + np.float32(0.25) * (before + after)
-                before = here
-    for k in range(side**3):
-        total += histogram[k]
+    for i in range(low[2], high[2]):
+        for j in range(low[1], high[1]):
+            for at in range((i * side + j) * side + low[0], (i * side + j) * side + high[0]):
+                total += histogram[at]
     histogram /= max(total, np.float32(1e-12))
 
 

@@ -10,6 +10,8 @@ between them (Viterbi, 1967).
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numba
 import numpy as np
 from numpy.typing import NDArray
@@ -119,8 +121,15 @@ def mirrored(T: Array) -> Array:
 
 def spun(T: Array, angle_rad: float, axis_xy_m: tuple[float, float] = (0.0, 0.0)) -> Array:
     """The pose with the object turned about the line through `axis_xy_m` along its own +z."""
-    turn = Rotation.from_rotvec([0.0, 0.0, angle_rad]).as_matrix()
-    return np.asarray(turned(T[None], np.zeros(1, int), turn[None], axis_xy_m)[0])
+    out = T.copy()
+    out[:3, :3] = T[:3, :3] @ _spin(angle_rad)
+    out[:3, 3] += (T[:3, :3] - out[:3, :3]) @ np.array([*axis_xy_m, 0.0])
+    return out
+
+
+@lru_cache(maxsize=2 * SPINS)
+def _spin(angle_rad: float) -> Array:
+    return np.asarray(Rotation.from_rotvec([0.0, 0.0, angle_rad]).as_matrix())
 
 
 @numba.njit(cache=True)

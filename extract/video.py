@@ -8,7 +8,7 @@ one clear error at the start and not a short track at the end.
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterator, Sequence
+from collections.abc import Container, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from fractions import Fraction
@@ -113,10 +113,13 @@ def read_video_info(path: Path) -> VideoInfo:
     return VideoInfo(path, width_px, height_px, times - times[0], _rotation_deg(first), sha256_of_file(path))
 
 
-def iterate_frames(path: Path, max_side_px: int | None = None, info: VideoInfo | None = None) -> Iterator[Frame]:
+def iterate_frames(
+    path: Path, max_side_px: int | None = None, info: VideoInfo | None = None, wanted: Container[int] | None = None
+) -> Iterator[Frame]:
     """Yield the frames of a video in presentation order, shrunk so that the longer side is at most `max_side_px`.
 
-    info: from `read_video_info`, which is called when it is not given.
+    info: from `read_video_info`, which is called when it is not given.  wanted: indices of the frames asked for, of
+    all when None.
     Frames that cannot be decoded and frames whose time does not advance are left out. Raises UserError when more
     than MAX_BROKEN_FRACTION of the file's frames cannot be decoded.
     """
@@ -128,7 +131,8 @@ def iterate_frames(path: Path, max_side_px: int | None = None, info: VideoInfo |
         if time_s <= last_s:
             continue
         last_s = time_s
-        yield Frame(count, time_s - start_s, _shrunk(_upright(frame), max_side_px))
+        if wanted is None or count in wanted:
+            yield Frame(count, time_s - start_s, _shrunk(_upright(frame), max_side_px))
         count += 1
     if count < info.frame_count * (1 - MAX_BROKEN_FRACTION) - 1:
         raise UserError(f"video {path} is damaged: {count} of {info.frame_count} frames can be decoded; copy it again")
@@ -159,7 +163,7 @@ def sample_frames(info: VideoInfo, count: int, max_side_px: int | None = None) -
     """At most `count` frames spread evenly over a video, in order."""
     wanted = np.unique(np.linspace(0, info.frame_count - 1, count).round().astype(int))
     if info.frame_count <= SEEK_ABOVE * count:
-        return [frame for frame in iterate_frames(info.path, max_side_px, info) if frame.index in wanted]
+        return list(iterate_frames(info.path, max_side_px, info, set(wanted.tolist())))
     # Reading a long video to its end takes minutes; entering it at a few places does not.
     origin = next(_decode(info.path), None)
     start_s = 0.0 if origin is None else float(origin.time or 0.0)

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from vid2demo.extract.first_pose import PoseCandidate, distinct, is_upright, upright_rotation
+from vid2demo.extract.first_pose import PoseCandidate, distinct, is_upright, silhouette_ious, upright_rotation
 from vid2demo.extract.geometry import Symmetry, make_pose
+from vid2demo.extract.raster import render_depth
+from vid2demo.extract.region import TrackingMesh
+from vid2demo.extract.segment import mask_box
 
 
 @pytest.mark.parametrize(
@@ -69,3 +72,29 @@ def test_distinct_poses_are_limited_in_number_and_in_how_much_worse_they_are() -
     assert len(distinct(pool, 40, 4, 0.8, Symmetry())) == 4
     merits = np.array([c.merit for c in pool])
     assert np.all(np.diff(merits) < 0)
+
+
+@pytest.mark.parametrize("x_m", [0.0, 0.22, -0.25, 0.6])
+@pytest.mark.parametrize("trusted", [True, False])
+def test_silhouettes_are_compared_with_masks_in_the_image_and_as_far_as_these_are_trusted(
+    x_m: float, trusted: bool
+) -> None:
+    rng = np.random.default_rng(1)
+    corners = 0.1 * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0], [0, 0, 1]], float)
+    faces = np.array([[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4], [0, 2, 1], [0, 3, 2]], np.int32)
+    mesh = TrackingMesh.build(corners, faces)
+    K, T = np.array([[200.0, 0, 60], [0, 200, 45], [0, 0, 1]]), make_pose(upright_rotation(20, 30), (x_m, 0.0, 0.7))
+    mask = np.zeros((90, 120), bool)
+    mask[20:60, 45:100] = True
+    trust = None if trusted else rng.choice(np.array([0.5, 1.0], np.float32), mask.shape)
+    window = render_depth(mesh.vertices_m, mesh.faces, T, K)
+    assert window is not None
+    silhouette = window.mask_in_image(120, 90)
+    weight = np.ones(mask.shape) if trust is None else trust.astype(float)
+    found = silhouette_ious(mesh, T, K, mask, mask_box(silhouette) if silhouette.any() else mask_box(mask), trust)
+    if x_m == 0.6:  # out of the picture
+        assert not silhouette.any()
+        assert found == (0.0, 0.0)
+    else:
+        assert found[0] == pytest.approx(weight[silhouette & mask].sum() / weight[silhouette | mask].sum())
+        assert found[1] == pytest.approx(1.0)
