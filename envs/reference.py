@@ -40,7 +40,8 @@ class Reference:
     video_time_s: (N,) the video's clock at each knot, not decreasing (a hold repeats it); `time_s` by default.
     header: JSON-like; `symmetry`, `vessel` ({"library": {category, params}} or {"file", "unit", "up", ...}),
         `receptacle` (the same and `T_world_receptacle`), `T_hand_object` (4x4, object in `panda_hand_tcp`),
-        `q_start_rad` (7), `scale`, `time_stretch`, `T_world_camera`, `notes` (list of sentences), `feasibility`.
+        `q_start_rad` (7), `grasp`, `scale`, `time_stretch`, `T_world_camera`, `notes` (list of sentences), `changed`
+        (leaps of the tracker that were bridged), `scale_search` (the pours tried and what came of them), `feasibility`.
     """
 
     T_world_object: Array
