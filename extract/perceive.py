@@ -24,12 +24,12 @@ from .errors import UserError
 from .files import atomic_path
 from .focal import focal_of_clip, scaled_focal
 from .follow import Followed
-from .geometry import Array, focal_prior_camera_matrix
+from .geometry import Array, focal_prior_camera_matrix, projected_box
 from .masks import read_mask, write_masks
 from .overlay import OverlayItem, write_overlay
 from .progress import Progress
 from .rerun_log import load_rerun, write_rerun
-from .segment import Mask, check_box, mask_box
+from .segment import Box, Mask, check_box, mask_box
 from .smoothing import smooth_poses
 from .starting import STARTING_SIDE_PX, WORKING_SIDE_PX, NotFoundError, Start, resized, scaled, sharpened, start_object
 from .track import ObjectTrack
@@ -38,6 +38,8 @@ from .video import Image, VideoInfo, iterate_frames, read_video_info, sample_fra
 TRUSTED_CONFIDENCE = 0.6  # mean over the clip, of an object that nobody pointed at
 SURE_OF_CAMERA = 0.5  # median share of the background that agrees on how the camera turned
 LESS_SURE = 0.05  # of confidence, that a focal length told by the clip may cost: noise, if it is right
+SURELY_FOLLOWED = 0.65  # mean confidence over the clip, below which it is tried from another frame as well
+AWAY_FRAMES, FOLLOWED_THERE, ELSEWHERE_MARGIN = 12, 0.4, 0.15  # least distance, confidence and gain of that
 SEEN_SHARE = 0.1  # of the clip, least
 OTHER_FRAMES = (45,)  # looked at when what was found in the first cannot be followed surely
 
@@ -125,6 +127,11 @@ def extract(
             break
         report(0, info.frame_count, f"looking again for {requests[0].name}, in another frame")
     best = max(attempts, key=lambda attempt: attempt.sure)
+    if best.sure < SURELY_FOLLOWED:
+        report(0, info.frame_count, f"looking again for {requests[0].name}, in a frame that shows it better")
+        again = _from_elsewhere(best, requests, models, report, camera_motion != "static")
+        if again is not None and again.sure > best.sure + ELSEWHERE_MARGIN:
+            best = again
     camera_told: dict[str, Any] = {"source": camera_source}
     if camera is None and requests[0].mesh is not None:
         best, camera_told = _with_told_focal(best, requests, models, report, camera_motion != "static")
@@ -179,6 +186,33 @@ def _attempt(
     return _Attempt(scene, sharp, index, starts, followed, watched)
 
 
+def _from_elsewhere(
+    first: _Attempt, requests: Sequence[ObjectRequest], models: Sequence[list[Model]], report: Progress, watch: bool
+) -> _Attempt | None:
+    """The objects looked for again where they were followed most surely, away from where they were found.
+
+    A thing that was lifted has left its shadow, and a hand that moves hides other parts of it.
+    """
+    scene = first.scene
+    sure = np.array([e.confidence * e.visible for e in first.followed[0].estimates])
+    sure[max(0, first.index - AWAY_FRAMES) : first.index + AWAY_FRAMES + 1] = 0.0
+    index = int(np.argmax(sure))
+    boxes = [
+        projected_box(f.camera_matrix, f.estimates[index].T_camera_object, f.mesh.vertices_m) for f in first.followed
+    ]
+    if sure[index] < FOLLOWED_THERE or any(box is None for box in boxes):
+        return None
+    frames = iterate_frames(scene.info.path, STARTING_SIDE_PX, scene.info)
+    sharp = next((frame.rgb for frame in frames if frame.index == index), None)
+    if sharp is None:
+        return None
+    try:
+        starts = _find_in(sharp, scene, requests, models, [scaled(b, 1 / scene.scale) for b in boxes if b is not None])
+    except UserError:
+        return None
+    return _attempt(scene, index, sharp, starts, report, watch)
+
+
 def _with_told_focal(
     first: _Attempt,
     requests: Sequence[ObjectRequest],
@@ -201,8 +235,10 @@ def _with_told_focal(
         return refused
     report(0, scene.info.frame_count, "following again, with the focal length that the clip tells")
     scene = replace(scene, camera_matrix=scaled_focal(scene.camera_matrix, told.factor))
+    elsewhere = first.starts[0].box_source == "followed"
+    there = [scaled(start.best.box, 1 / scene.start_scale) for start in first.starts]
     try:
-        starts = _find_in(first.sharp, scene, requests, models)
+        starts = _find_in(first.sharp, scene, requests, models, there if elsewhere else None)
     except NotFoundError:
         return refused
     second = _attempt(scene, first.index, first.sharp, starts, report, watch_camera)
@@ -259,8 +295,13 @@ def _found(
 
 
 def _find_in(
-    sharp: Image, scene: _Scene, requests: Sequence[ObjectRequest], models: Sequence[list[Model]]
+    sharp: Image,
+    scene: _Scene,
+    requests: Sequence[ObjectRequest],
+    models: Sequence[list[Model]],
+    followed_to: Sequence[Box] | None = None,
 ) -> list[Start]:
+    """The objects in a frame. followed_to: boxes in px of the video around where they were followed to, if so."""
     info, small = scene.info, _small(sharp, scene)
     labels = None if scene.background is None else scene.background.labels(small)
     # What moved at any time, or, better, what covers something that was seen at another time.
@@ -268,9 +309,12 @@ def _find_in(
     if labels is not None:
         moved = np.array(COVERED)[labels]
     starts: list[Start] = []
-    for request, candidates in zip(requests, models, strict=True):
+    for number, (request, candidates) in enumerate(zip(requests, models, strict=True)):
         mask = None
-        if request.mask is not None:
+        if followed_to is not None:
+            seen = check_box(followed_to[number], info.width_px, info.height_px)
+            box, source = scaled(seen, scene.start_scale), "followed"
+        elif request.mask is not None:
             mask = resized(read_mask(request.mask, info.width_px, info.height_px), sharp)
             box, source = mask_box(mask), "mask"
         elif request.box_xywh_px is not None:
@@ -313,6 +357,7 @@ def _header(request: ObjectRequest, scene: _Scene, start: Start, model: Model, i
     chosen = {
         "given": "the box that was given",
         "mask": "the mask that was given",
+        "followed": "where it was followed to from another frame, most surely",
         "found": f"found: what looks most like a {model.header['name']}, differs from its surroundings and moves",
     }[start.box_source]
     return {

@@ -107,6 +107,19 @@ def test_a_clip_is_followed_both_ways_from_any_frame(clip: Path, mesh_file: Path
         assert both > 0.9
 
 
+def test_what_was_followed_unsurely_is_followed_again_from_where_it_shows_best(
+    clip: Path, mesh_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("vid2demo.extract.perceive.SURELY_FOLLOWED", 1.1)  # nothing is
+    monkeypatch.setattr("vid2demo.extract.perceive.ELSEWHERE_MARGIN", -1.0)
+    monkeypatch.setattr("vid2demo.extract.perceive.AWAY_FRAMES", 3)
+    track = follow(clip, mesh_file, tmp_path)
+    assert track.header["settings"]["start_frame"] > 3
+    assert track.header["settings"]["box_source"] == "followed"
+    assert off_px(track, range(COUNT)) < 8  # the wedge looks nearly the same from behind
+    assert track.visible.all()
+
+
 def test_a_mask_says_where_the_object_is(clip: Path, mesh_file: Path, tmp_path: Path) -> None:
     file = tmp_path / "mask.png"
     cv2.imwrite(str(file), silhouette(3).astype(np.uint8) * 255)
