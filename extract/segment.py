@@ -22,7 +22,7 @@ def check_box(box_xywh_px: Box, width_px: int, height_px: int, source: str = "--
     x, y, w, h = box_xywh_px
     x_a, y_a = max(x, 0.0), max(y, 0.0)
     x_b, y_b = min(x + w, float(width_px)), min(y + h, float(height_px))
-    if x_b - x_a < 8 or y_b - y_a < 8:
+    if not (x_b - x_a >= 8 and y_b - y_a >= 8):  # written so that what is no number is refused as well
         raise UserError(
             f"{source} {x:g} {y:g} {w:g} {h:g} has less than 8 x 8 px inside the {width_px} x {height_px} image; "
             "give it as X Y WIDTH HEIGHT in pixels of the first frame"

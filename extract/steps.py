@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from .errors import UserError
 from .progress import Progress
 from .stages import Stage, plain
-from .wording import symmetry_in_words
+from .wording import symmetry_in_words, unseen_in_words
 
 if TYPE_CHECKING:
     from .choose import Level
@@ -35,6 +35,10 @@ class ObjectSettings:
     mask: Path | None = None
     mesh_up: str = "auto"
     mesh_open_top: bool = False
+
+    def __post_init__(self) -> None:
+        if self.box_xywh_px is not None and self.mask is not None:
+            raise UserError(f"--box and --mask {self.mask} both say where the object is; give one of them")
 
 
 @dataclass(frozen=True)
@@ -153,8 +157,13 @@ def _track_figures(track: Any) -> dict[str, Any]:
     if cuts := track.header["video"].get("cuts"):
         times = ", ".join(f"{cut['time_s']:.2f} s" for cut in cuts)
         figures["cuts"] = f"the video jumps to another shot at {times}"
-    if (camera := track.header["camera"]["motion"]["kind"]) != "static":
-        figures["camera"] = camera
+    if unseen := unseen_in_words(track.time_s, track.visible):
+        figures["not_seen"] = unseen
+    camera = track.header["camera"]
+    if camera["motion"]["kind"] != "static":
+        figures["camera"] = camera["motion"]["kind"]
+    if camera.get("source") == "estimated":
+        figures["focal_length"] = f"{camera['focal_px']:g} px, give or take {camera['std_px']:g}, told by the clip"
     faces = mesh.get("faces", {})
     if faces and faces["tracked"] < faces["in_file"]:
         figures["decimated"] = f"{faces['in_file']} faces in the file, {faces['tracked']} tracked"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 
@@ -20,6 +20,21 @@ def measures_of(vessel: Any) -> dict[str, Any]:
 def symmetry_in_words(order: int, axis: str = "z") -> str:
     """Order of a rotational symmetry (0 = continuous, 1 = none) for a reader."""
     return {0: f"about {axis}", 1: "none"}.get(order, f"{order}-fold about {axis}")
+
+
+def unseen_in_words(time_s: Sequence[float], visible: Sequence[bool]) -> str:
+    """When an object was out of view or lost, by the times of the frames and whether each shows it; "" for never."""
+    spans: list[list[int]] = []
+    for k in (k for k, seen in enumerate(visible) if not seen):
+        if spans and spans[-1][1] == k - 1:
+            spans[-1][1] = k
+        else:
+            spans.append([k, k])
+    words = []
+    for first, last in spans:
+        end = "the end" if last == len(visible) - 1 else f"{time_s[last]:.2f} s"
+        words.append(f"{time_s[first]:.2f} s to {end}")
+    return ", ".join(words)
 
 
 def as_lines(value: Mapping[str, Any], depth: int = 0) -> list[str]:
