@@ -1,6 +1,6 @@
 """The paper's way through a video: single frames, and translations by single frames, by point tracks, and by both.
 
-    python bench/video_refinement.py [--clips mustard mug:0 ...] [--frames 120] [--shared ../shared] [--json FILE]
+    python bench/video_refinement.py [--clips mustard mug:0 ...] [--level auto] [--shared ../shared] [--json FILE]
 
 Rows: single frames alone; then PnP's rotations with each of the three translations, before smoothing and after. A clip
 is `mustard` (a real recording, exact mesh) or CATEGORY:SEED (rendered, the exact vessel as the mesh).

@@ -133,6 +133,8 @@ def extract_by_views(
     if rerun:
         load_rerun()
     info = read_video_info(video)
+    if len({request.name for request in requests}) < len(requests):
+        raise UserError("two objects have the same name; give each its own")
     if start_frame is not None and not 0 <= start_frame < info.frame_count:
         raise UserError(f"--start-frame {start_frame}: {info.path} has the frames 0 to {info.frame_count - 1}")
     camera_matrix, camera_source = camera_of_video(info, camera)
