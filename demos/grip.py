@@ -47,8 +47,8 @@ class Grip:
             f"{100 * self.part:.0f}% of what {FINGER_MAX_N:.0f} N a finger hold"
         )
         if self.part <= 1.0:
-            return f"Friction alone would hold the vessel: {told}."
-        return f"Friction alone would let the vessel slip or turn in the fingers: {told}; in simulation weld it."
+            return f"Friction alone should hold the vessel: {told}."
+        return f"Friction alone may let the vessel slip or turn in the fingers: {told}."
 
     def told(self) -> dict[str, Any]:
         """The figures (JSON-like)."""
