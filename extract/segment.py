@@ -70,8 +70,8 @@ def mask_from_silhouette(rgb: Image, silhouette: Mask, band_px: int, iterations:
 
 def mask_box(mask: Mask) -> Box:
     """Bounding box x, y, width, height of a mask that is not empty."""
-    ys, xs = np.nonzero(mask)
-    return float(xs.min()), float(ys.min()), float(np.ptp(xs) + 1), float(np.ptp(ys) + 1)
+    ys, xs = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    return float(xs[0]), float(ys[0]), float(np.ptp(xs) + 1), float(np.ptp(ys) + 1)
 
 
 def _rare_outside(rgb: Image, box: tuple[int, int, int, int]) -> Mask:
