@@ -77,7 +77,8 @@ def load_truth(path: Path) -> Truth:
             names = set(archive.files)
             arrays = {name: np.asarray(archive[name], np.float64) for name in _TRUTH_ARRAYS if name in names}
     except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
-        raise UserError(f"{path} cannot be read as a truth ({error}); give a track or a plain npz") from error
+        # What NumPy says of such files is how to load them unsafely.
+        raise UserError(f"{path} cannot be read as a truth: damaged or no npz; give a track or a plain npz") from error
     if missing := [name for name in _TRUTH_ARRAYS if name not in arrays]:
         raise UserError(
             f"{path} lacks {', '.join(missing)}; a truth is a track or an npz with {', '.join(_TRUTH_ARRAYS)}"
