@@ -94,8 +94,8 @@ class ImagePoser:
     ) -> list[ObjectPose]:
         """Every proposal with a mask as an object, in their order.
 
-        text: a word that narrows the search.  keys: the mesh of each proposal, when it is known.  sizes_m: their
-        largest extents, when these are known.
+        text: a word that narrows the search and tells usual sizes.  keys: the mesh of each proposal, when it is known.
+        sizes_m: their largest extents, when these are known.
         """
         shown = [k for k, proposal in enumerate(proposals) if proposal.mask.any()]
         looks = [look_at_object(self.features, self.store.settings.extend, [(rgb, proposals[k].mask)]) for k in shown]
@@ -107,7 +107,7 @@ class ImagePoser:
         if sizes_m is not None:
             sizes = [(float(sizes_m[k]), "given") for k in shown]
         else:
-            sizes = self._reconciled(rgb, masks, camera_matrix, self._guessed(rgb, masks, hits))
+            sizes = self._reconciled(rgb, masks, camera_matrix, self._guessed(rgb, masks, hits, text))
         return [
             self._best(proposals[k], look, found, size, camera_matrix)
             for k, look, found, size in zip(shown, looks, hits, sizes, strict=True)
@@ -119,12 +119,13 @@ class ImagePoser:
             self._meshes[key] = self.store.mesh(key)
         return self._meshes[key]
 
-    def size_of(self, about: About) -> tuple[float, str]:
+    def size_of(self, about: About, word: str | None = None) -> tuple[float, str]:
         """A mesh's usual largest extent [m] and who says so.
 
-        Its own, where its file told the unit and the size table does not contradict; else the table's.
+        Its own, where its file told the unit and the size table does not contradict; else the table's. The entry is
+        that of a person's word for the object, or of the mesh's category.
         """
-        entry = self._table.find(about.category or about.name)
+        entry = (self._table.find(word) if word else None) or self._table.find(about.category or about.name)
         own_m = max(about.extents_m)
         if own_m > 0 and (entry is None or entry.holds(own_m)):
             return own_m, "the mesh"
@@ -140,10 +141,12 @@ class ImagePoser:
     def _known(self, key: str) -> Hit:
         return Hit(key, self.mesh(key).about, 1.0)
 
-    def _guessed(self, rgb: Image, masks: Sequence[Mask], hits: Sequence[Sequence[Hit]]) -> list[tuple[float, str]]:
+    def _guessed(
+        self, rgb: Image, masks: Sequence[Mask], hits: Sequence[Sequence[Hit]], word: str | None
+    ) -> list[tuple[float, str]]:
         """What such things usually measure [m], and who says so, object by object."""
         if self._words is None or not masks:
-            return [self.size_of(found[0].about) for found in hits]
+            return [self.size_of(found[0].about, word) for found in hits]
         read = self._words.guess(rgb, masks, [mask_box(mask) for mask in masks])
         return [(guess.size_m, guess.source) for guess in read]
 

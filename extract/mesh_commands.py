@@ -26,8 +26,9 @@ MeshName = Positional[Annotated[str | None, arg(metavar="NAME", help="A category
 class MeshesOnboard(Command):
     """Take meshes into a database: cleaned, normalised, seen from all sides, described. Goes on where it was stopped.
 
-    FOLDER holds GLB, OBJ, PLY or STL files: Objaverse's or Google Scanned Objects' folders, folders named by category,
-    or anything flat. The word "library" stands for seeded variants of the vessels that ship.
+    FOLDER holds GLB, OBJ, PLY or STL files: Objaverse's folders (its own package, our extra `objaverse`, fetches them),
+    those of Google Scanned Objects, folders named by category, or anything flat. The word "library" stands for seeded
+    variants of the vessels that ship.
 
     For example: vid2demo meshes onboard scans --out runs/meshes --workers 8
     """

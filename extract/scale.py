@@ -139,13 +139,6 @@ def principal_extents(points: Array) -> Array:
     return np.asarray(np.sort(np.ptp(centred @ axes, axis=0))[::-1])
 
 
-def guess_from_words(words: str, table: SizeTable | None = None) -> SizeGuess:
-    """The table's size for what somebody calls an object. Raises UserError, naming what comes near, if it has none."""
-    table = table or own_table()
-    entry = table.look_up(words)
-    return SizeGuess(entry.typical_m, (entry.phrase,), f"{words!r} in the size table {table.name}")
-
-
 class SizeReader:
     """Reads the sizes of objects off their pictures: the median size of the K phrases most like each of them."""
 

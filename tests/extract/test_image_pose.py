@@ -104,6 +104,19 @@ def test_the_size_table_overrules_a_mesh_of_an_unlikely_size(root: Path) -> None
     assert poser.size_of(unknown)[0] == ANY_SIZE_M
 
 
+def test_a_person_s_word_selects_the_size(root: Path) -> None:
+    poser = ImagePoser(MeshStore.open(root), ClassicalFeatures())
+    sizeless = About("a", "zorblax", "a.glb", (0.0, 0.0, 0.0), 0.06, "", (0.0, 0.0, 0.0), 10)
+    assert poser.size_of(sizeless, "my blue coffee mugs") == poser.size_of(replace(sizeless, category="mug"))
+    # A word that the table does not know leaves the mesh's category to tell.
+    mug = replace(sizeless, category="mug")
+    assert poser.size_of(mug, "frobnicator") == poser.size_of(mug)
+    # A mesh that knows its size is believed within the word's range, not beyond it.
+    large = replace(sizeless, unit="m", extents_m=(0.12, 0.1, 0.1))
+    assert poser.size_of(large, "mug") == (0.12, "the mesh")
+    assert poser.size_of(large, "wardrobe")[0] > 1.0
+
+
 def test_blobs_on_a_plain_table_are_found(scene) -> None:  # type: ignore[no-untyped-def]
     rgb, masks, _ = scene
     segmenter = ClassicalSegmenter()

@@ -7,14 +7,12 @@ import numpy as np
 import pytest
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
-from vid2demo.extract.errors import UserError
 from vid2demo.extract.geometry import focal_prior_camera_matrix, invert_pose, look_at, make_pose
 from vid2demo.extract.neural_words import NeuralWords
 from vid2demo.extract.raster import render_depth
 from vid2demo.extract.scale import (
     SceneSizes,
     SizeReader,
-    guess_from_words,
     largest_part,
     measured_size,
     near_median,
@@ -209,14 +207,6 @@ def test_extents_do_not_depend_on_the_pose() -> None:
 def test_video_takes_the_median_over_its_frames() -> None:
     frames = [SceneSizes(np.array([0.1 * k, 0.3]), 1.0, np.zeros(2)) for k in (1, 2, 9)]
     np.testing.assert_allclose(sizes_over_frames(frames), [0.2, 0.3])
-
-
-def test_words_select_the_entry_where_no_model_looks() -> None:
-    guess = guess_from_words("my blue coffee mugs")
-    assert guess.size_m == own_table().look_up("mug").typical_m
-    assert guess.phrases == ("mug",)
-    with pytest.raises(UserError, match="no entry"):
-        guess_from_words("frobnicator")
 
 
 def test_model_reads_the_median_size_of_the_11_likeliest_phrases(tiny_models: Path) -> None:
