@@ -115,7 +115,7 @@ def _changes(tries: list[Try], scale: float) -> Iterator[Change]:
         best = _best(tries)
         if best.score < ENOUGH and best.poured + best.spilled < ENOUGH:
             yield replace(best.change, tip_deg=tip_deg)
-            if _best(tries) is best:
+            if tries[-1].score < best.score:  # where nothing flows yet, more may be needed
                 break
 
 

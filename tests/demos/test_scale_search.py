@@ -42,8 +42,9 @@ def test_a_receptacle_that_is_missed_is_moved_under_the_jet(faithful: Reference)
     np.testing.assert_array_equal(found.T_world_object, faithful.T_world_object)
 
 
-def test_what_is_tipped_too_little_is_tipped_further(faithful: Reference) -> None:
-    little = tipped_further(faithful, -25.0)
+@pytest.mark.parametrize("less_deg", [25.0, 40.0])  # so little that tipping it somewhat does not help yet
+def test_what_is_tipped_too_little_is_tipped_further(faithful: Reference, less_deg: float) -> None:
+    little = tipped_further(faithful, -less_deg)
     found = search_scale(little, no_other)
     chosen = next(t for t in found.header["scale_search"] if t["chosen"])
     assert chosen["tip_deg"] > 0.0
