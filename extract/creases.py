@@ -7,11 +7,14 @@ camera, which its outline hardly does.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from .geometry import Array
+from .geometry import Array, invert_pose, project, transform_points
+from .raster import DepthWindow
 
 JUMP = 0.08  # of the mesh's radius, in depth, that makes an inner contour
 BEND = 0.5  # length of the difference of unit normals BEND_PX to either side that makes one: half a radian
@@ -22,6 +25,53 @@ REACH = 3  # steps on either side of a crease that are looked at for an edge, an
 REACH_PX = 4.0
 EDGE_FLOOR, EDGE_WEIGHT = 0.1, 2.0  # a place on a clear edge is (1.1 / 0.1)^2 times likelier than one on none
 LEAST_EDGE = 0.3  # of the strongest edge along a line, below which there is nothing to hold on to
+
+
+@dataclass(frozen=True)
+class Creases:
+    """Points of inner contours (N, 3) and directions across them (N, 3) in the mesh's frame; which are jumps (N,)."""
+
+    point_object_m: Array
+    normal_object: Array
+    jump: NDArray[np.bool_]
+
+    def seen(self, T_camera_object: Array, camera_matrix: Array) -> tuple[Array, Array]:
+        """Where a pose shows them, (N, 2) px, and which way across, unit (N, 2)."""
+        normal = self.normal_object @ T_camera_object[:2, :3].T
+        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
+        return project(camera_matrix, transform_points(T_camera_object, self.point_object_m)), normal
+
+    def read(
+        self,
+        T_camera_object: Array,
+        camera_matrix: Array,
+        edges: NDArray[np.float32],
+        step_px: float,
+        told: NDArray[np.bool_],
+    ) -> tuple[Array, Array, Array, Array]:
+        """Points (N, 3), targets (N, 2), normals (N, 2) and variances (N,) in px of those that show as image edges.
+
+        edges: (H, W, 2) from `edge_strength`.  told: (H, W) false where something hides what is there.
+        """
+        pixel, normal = self.seen(T_camera_object, camera_matrix)
+        mean_px, variance = np.zeros(len(pixel)), np.zeros(len(pixel))
+        _measure(pixel, normal, edges, step_px, mean_px, variance)
+        x, y = np.clip(np.round(pixel), 0, [told.shape[1] - 1, told.shape[0] - 1]).astype(int).T
+        kept = (variance > 0) & told[y, x]
+        target = pixel[kept] + mean_px[kept, None] * normal[kept]
+        return self.point_object_m[kept], target, normal[kept], variance[kept]
+
+
+def draw_creases(window: DepthWindow, radius_m: float, T_camera_object: Array, camera_matrix: Array) -> Creases | None:
+    """The inner contours of a mesh of that radius, drawn at a pose; None when there are none."""
+    at, normal, jump = crease_pixels(window.depth_m, camera_matrix, radius_m)
+    if len(at) == 0:
+        return None
+    z = window.depth_m[at[:, 1], at[:, 0]].astype(float)
+    pixel = at + np.array([window.x0_px, window.y0_px]) + 0.5 * normal
+    rays = np.column_stack([(pixel - camera_matrix[:2, 2]) / np.diag(camera_matrix)[:2], np.ones(len(z))])
+    points = transform_points(invert_pose(T_camera_object), rays * z[:, None])
+    return Creases(points, normal @ T_camera_object[:2, :3], jump)
 
 
 def crease_pixels(
@@ -108,7 +158,7 @@ def find_creases(
 
 
 @numba.njit(cache=True)
-def measure_creases(
+def _measure(
     pixel: Array, normal: Array, edges: NDArray[np.float32], step_px: float, mean_px: Array, variance: Array
 ) -> None:
     """Posterior mean and variance (N,) in px of each crease along its line, by the image edges (H, W, 2) there.

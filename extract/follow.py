@@ -167,7 +167,8 @@ class Followed:
             return vessel, poses
         chosen = [kept[k] for k in np.unique(np.linspace(0, len(kept) - 1, FIT_VIEWS).round().astype(int))]
         views = [
-            View(g.bins, g.colours, poses[g.index], None, g.edges)
+            # Local colours were learned along the outline that is to be mended, and belong to its mesh.
+            View(g.bins, g.colours.everywhere(), poses[g.index], None, g.edges)
             for g in chosen
             if g.bins is not None and g.colours is not None
         ]

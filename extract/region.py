@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from .creases import crease_pixels, measure_creases
+from .creases import Creases, draw_creases
 from .geometry import Array, invert_pose, make_pose, project, transform_points
-from .raster import DepthWindow, render_depth
+from .raster import render_depth
 from .region_kernels import (
     count_bins,
     free_lengths,
@@ -64,21 +64,6 @@ class TrackingMesh:
     @cached_property
     def radius_m(self) -> float:
         return float(np.linalg.norm(self.vertices_m, axis=1).max())
-
-
-@dataclass(frozen=True)
-class Creases:
-    """Points of inner contours (N, 3) and directions across them (N, 3) in the mesh's frame; which are jumps (N,)."""
-
-    point_object_m: Array
-    normal_object: Array
-    jump: NDArray[np.bool_]
-
-    def seen(self, T_camera_object: Array, camera_matrix: Array) -> tuple[Array, Array]:
-        """Where a pose shows them, (N, 2) px, and which way across, unit (N, 2)."""
-        normal = self.normal_object @ T_camera_object[:2, :3].T
-        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
-        return project(camera_matrix, transform_points(T_camera_object, self.point_object_m)), normal
 
 
 @dataclass(frozen=True)
@@ -164,6 +149,13 @@ class ColourModel:
         twin.hiding = self.hiding.copy()
         return twin
 
+    def everywhere(self) -> ColourModel:
+        """The colours of the object as a whole, without those around points of one mesh."""
+        whole = ColourModel()
+        whole.foreground[-1], whole.background[-1] = self.foreground[-1], self.background[-1]
+        whole.seen[-1], whole.hiding = 1.0, self.hiding
+        return whole
+
     def start_global(self, foreground: NDArray[np.int32], background: NDArray[np.int32]) -> None:
         """Set the global histograms (row LOCAL_CENTRES) from colour bins of labelled pixels."""
         for histogram, bins in ((self.foreground, foreground), (self.background, background)):
@@ -248,7 +240,9 @@ def extract_outline(
     return None if outline is None else outline.inside(image_shape)
 
 
-def draw_outline(mesh: TrackingMesh, T_camera_object: Array, camera_matrix: Array, count: int = 300) -> Outline | None:
+def draw_outline(
+    mesh: TrackingMesh, T_camera_object: Array, camera_matrix: Array, count: int = 300, with_creases: bool = True
+) -> Outline | None:
     """Sample the whole boundary of the silhouette, in the image or not; None when the object cannot be drawn."""
     window = render_depth(mesh.vertices_m, mesh.faces, T_camera_object, camera_matrix, margin_px=24)
     if window is None:
@@ -280,19 +274,8 @@ def draw_outline(mesh: TrackingMesh, T_camera_object: Array, camera_matrix: Arra
     free_lengths(contour.astype(np.float64), normal, mask, inside, outside)
     nearest = mesh.tree.query(points, k=3)[1].astype(np.int32)
     normal_object = normal @ T_camera_object[:2, :3]
-    creases = _draw_creases(window, mesh.radius_m, T_camera_object, camera_matrix)
+    creases = draw_creases(window, mesh.radius_m, T_camera_object, camera_matrix) if with_creases else None
     return Outline(pixel, normal, points, normal_object, inside, outside, nearest, T_camera_object, creases)
-
-
-def _draw_creases(window: DepthWindow, radius_m: float, T_camera_object: Array, camera_matrix: Array) -> Creases | None:
-    at, normal, jump = crease_pixels(window.depth_m, camera_matrix, radius_m)
-    if len(at) == 0:
-        return None
-    z = window.depth_m[at[:, 1], at[:, 0]].astype(float)
-    pixel = at + np.array([window.x0_px, window.y0_px]) + 0.5 * normal
-    rays = np.column_stack([(pixel - camera_matrix[:2, 2]) / np.diag(camera_matrix)[:2], np.ones(len(z))])
-    points = transform_points(invert_pose(T_camera_object), rays * z[:, None])
-    return Creases(points, normal @ T_camera_object[:2, :3], jump)
 
 
 @dataclass(frozen=True)
@@ -404,7 +387,7 @@ def refine(
         found = np.zeros((6, 6))
         point, target, normal = lines.outline.point_object_m, lines.target_px, lines.outline.normal
         if edges is not None and outline is not None and outline.creases is not None:
-            inner = _read_creases(outline.creases, T, camera_matrix, bins, edges, lines.step_px)
+            inner = outline.creases.read(T, camera_matrix, edges, lines.step_px, bins != HIDDEN_BIN)
             point, target, normal = (np.concatenate(pair) for pair in zip((point, target, normal), inner, strict=False))
             inverse_variance = np.concatenate([inverse_variance, CREASE_WEIGHT / inner[3]])
         cost = solve_pose(
@@ -416,7 +399,7 @@ def refine(
 
     for number, step_px in enumerate(steps_px):
         if outline is None or not outline.serves(T):
-            outline = draw_outline(mesh, T, camera_matrix)
+            outline = draw_outline(mesh, T, camera_matrix, with_creases=edges is not None)
         here = None if outline is None else outline.moved(T, camera_matrix).inside((bins.shape[0], bins.shape[1]))
         lines = None if here is None else measure(mesh, T, camera_matrix, bins, colours, step_px, edges, here)
         if lines is None:
@@ -427,24 +410,6 @@ def refine(
         T, information, cost = solved(lines, points.weight)
         strain = (cost - alone) / count if alone else 0.0
     return Refinement(T, score, count, information, outline, strain)
-
-
-def _read_creases(
-    creases: Creases,
-    T_camera_object: Array,
-    camera_matrix: Array,
-    bins: NDArray[np.int32],
-    edges: NDArray[np.float32],
-    step_px: float,
-) -> tuple[Array, Array, Array, Array]:
-    """Points (N, 3), targets (N, 2), normals (N, 2) and variances (N,) of the inner contours that show as edges."""
-    pixel, normal = creases.seen(T_camera_object, camera_matrix)
-    mean_px, variance = np.zeros(len(pixel)), np.zeros(len(pixel))
-    measure_creases(pixel, normal, edges, step_px, mean_px, variance)
-    x, y = np.clip(np.round(pixel), 0, [bins.shape[1] - 1, bins.shape[0] - 1]).astype(int).T
-    kept = (variance > 0) & (bins[y, x] != HIDDEN_BIN)
-    target = pixel[kept] + mean_px[kept, None] * normal[kept]
-    return creases.point_object_m[kept], target, normal[kept], variance[kept]
 
 
 def _prior(T: Array, up: Array, rotation_rad: float, spin_rad: float | None, sideways: float, depth: float) -> Array:

@@ -117,7 +117,7 @@ def test_inner_contours_tell_how_a_cup_leans(monkeypatch: pytest.MonkeyPatch) ->
         return float(np.rad2deg(np.arccos(np.clip(up @ right, -1, 1))))
 
     with_creases = lean_error_deg()
-    monkeypatch.setattr("vid2demo.extract.region._draw_creases", lambda *_: None)
+    monkeypatch.setattr("vid2demo.extract.region.draw_creases", lambda *_: None)
     assert with_creases < 2.0
     assert with_creases <= lean_error_deg() + 0.1
 
