@@ -109,11 +109,11 @@ def demo(
 ) -> dict[str, Any]:
     """`run` on a clip that `synthesize` wrote, told no more of it than a person could tell."""
     truth = json.loads((clip / "settings.json").read_text(encoding="utf-8"))
-    camera, box = truth["camera_matrix"], truth["boxes_xywh_px"]["receptacle"]
+    camera, boxes = truth["camera_matrix"], {k: tuple(box) for k, box in truth["boxes_xywh_px"].items()}
     settings = RunSettings(
         clip / "video.mp4",
-        ObjectSettings(category),
-        ObjectSettings(receptacle, (box[0], box[1], box[2], box[3])),
+        ObjectSettings(category, boxes["object"]),
+        ObjectSettings(receptacle, boxes["receptacle"]),
         camera=(camera[0][0], camera[1][1], camera[0][2], camera[1][2]),
         episodes=episodes,
         seed=seed,
