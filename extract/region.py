@@ -31,15 +31,17 @@ from .region_kernels import (
 )
 from .video import Image
 
-BITS, CHROMA_STEP = 4, 4  # per channel of the histograms; of Lab's a and b, in a bin
+BITS = 4  # colour resolution per channel of the local histograms
+CHROMA_STEP = 4  # of Lab's a and b, in a bin
 BINS = 1 << (3 * BITS)
 HIDDEN_BIN = BINS - 1  # bright, red and yellow at once: no colour is; of pixels that say nothing
 LEAST_ODDS = 0.4  # of the object's colours against those of a hand, of what is not taken for a hand
-HIDING_RATE, THICK = 0.1, np.ones((3, 3), np.uint8)  # what hides is thicker, in px
+HIDING_RATE = 0.1
 LOCAL_CENTRES = 48
 CLEAR_EDGE = 24.0  # grey levels per px
 SAME_SIDE, SAME_SIZE = float(np.cos(np.deg2rad(1.5))), 0.05  # of views that one outline serves
-POINT_LIMIT_PX, MASK_LEVELS = 3.0, 11  # levels of trust in a mask
+POINT_LIMIT_PX = 3.0
+MASK_LEVELS = 11  # of trust in a mask
 CREASE_WEIGHT = 0.1  # against the outline: a vessel of the library has its creases about there, not just there
 NO_EDGES = np.zeros((0, 0, 2), np.float32)
 
@@ -173,9 +175,7 @@ class ColourModel:
         That is, whose colours are less than `odds` times as likely the object's as those of what may hide it.
         """
         alien = self.foreground[-1] + 1e-5 < odds * (self.hiding + 1e-5)
-        # Along an outline colours mix: a seam of them hides nothing.
-        hidden = cv2.morphologyEx((covered & alien[bins]).astype(np.uint8), cv2.MORPH_OPEN, THICK)
-        return np.asarray(hidden > 0)
+        return np.asarray(covered & alien[bins])
 
     def hide(self, bins: NDArray[np.int32], covered: NDArray[np.bool_]) -> None:
         """Blank in `bins` (H, W) what hides the object.
