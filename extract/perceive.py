@@ -103,11 +103,7 @@ def extract(
     report = progress or (lambda done, total, what: None)
     if rerun:
         load_rerun()
-    info = read_video_info(video)
-    if len({request.name for request in requests}) < len(requests):
-        raise UserError("two objects have the same name; give each its own")
-    if start_frame is not None and not 0 <= start_frame < info.frame_count:
-        raise UserError(f"--start-frame {start_frame}: {info.path} has the frames 0 to {info.frame_count - 1}")
+    info = video_of_requests(video, requests, start_frame)
     camera_matrix, camera_source = camera_of_video(info, camera)
     longest = max(info.width_px, info.height_px)
     start_scale, scale = (min(1.0, side / longest) for side in (STARTING_SIDE_PX, WORKING_SIDE_PX))
@@ -158,6 +154,16 @@ def extract(
     items = [OverlayItem(track, f.mesh) for track, f in zip(tracks.values(), followed, strict=True)]
     write_tracks(info, items, [start.best.mask for start in starts], out, rerun=rerun, progress=report)
     return tracks
+
+
+def video_of_requests(video: Path, requests: Sequence[ObjectRequest], start_frame: int | None) -> VideoInfo:
+    """The video that is asked for. Raises UserError where it is none, or names or frame cannot be."""
+    info = read_video_info(video)
+    if len({request.name for request in requests}) < len(requests):
+        raise UserError("two objects have the same name; give each its own")
+    if start_frame is not None and not 0 <= start_frame < info.frame_count:
+        raise UserError(f"--start-frame {start_frame}: {info.path} has the frames 0 to {info.frame_count - 1}")
+    return info
 
 
 def write_tracks(

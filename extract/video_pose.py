@@ -33,7 +33,7 @@ from .meshes import METRES_PER_UNIT
 from .neural_segment import FOR_VIDEOS, large_enough
 from .onboarding import describe_views, read_source
 from .overlay import OverlayItem
-from .perceive import camera_of_video, write_tracks
+from .perceive import camera_of_video, video_of_requests, write_tracks
 from .point_tracks import ClassicalTracks
 from .progress import Progress
 from .protocols import Image, Mask, PatchFeatures, PointTracker, Segmenter
@@ -46,7 +46,7 @@ from .starting import WORKING_SIDE_PX, resized, scaled
 from .templates import ColoredMesh, ViewSettings
 from .track import ObjectTrack
 from .vessels import make_vessel, resolve_category
-from .video import Frame, VideoInfo, iterate_backward, iterate_frames, read_video_info
+from .video import Frame, VideoInfo, iterate_backward, iterate_frames
 
 VIEWS_KEPT = 20  # of every frame, among which the steadiest course is looked for
 TURN_COST = 0.3  # of a cosine, for a turn of one radian from one frame to the next; grows with its square
@@ -132,11 +132,7 @@ def extract_by_views(
     report = progress or (lambda done, total, what: None)
     if rerun:
         load_rerun()
-    info = read_video_info(video)
-    if len({request.name for request in requests}) < len(requests):
-        raise UserError("two objects have the same name; give each its own")
-    if start_frame is not None and not 0 <= start_frame < info.frame_count:
-        raise UserError(f"--start-frame {start_frame}: {info.path} has the frames 0 to {info.frame_count - 1}")
+    info = video_of_requests(video, requests, start_frame)
     camera_matrix, camera_source = camera_of_video(info, camera)
     means, chosen = find_means(level, models_dir)
     tracks: dict[str, ObjectTrack] = {}
