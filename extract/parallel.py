@@ -21,6 +21,7 @@ import cv2
 from .errors import UserError
 
 AHEAD = 2  # jobs handed out a worker: one at work, one waiting, so that an interruption ends soon
+AGAIN = 1  # times that Ray repeats a job whose process or machine was lost: it may have died of another's greed
 STARTS = 3  # of a Ray of our own: parts of it wait only so long for each other, which a busy machine can exceed
 STORE_BYTES = 80 * 1024**2  # of memory that a Ray started here shares; results are small, less it does not take
 
@@ -59,7 +60,7 @@ def on_cluster[Job, Found](
         there = ray.cluster_resources()
         if there.get("GPU", 0.0) < gpus:
             raise UserError(f"--gpus {gpus:g} is more than the {there.get('GPU', 0.0):g} that Ray has; give less")
-        task = ray.remote(num_cpus=1, num_gpus=gpus)(_alone)
+        task = ray.remote(num_cpus=1, num_gpus=gpus, max_retries=AGAIN)(_alone)
 
         def result(reference: Any) -> Any:
             try:

@@ -63,21 +63,21 @@ def test_a_cluster_that_is_not_there_is_named(fragile: Any, monkeypatch: pytest.
 def test_ray_gives_what_processes_give(
     tmp_path: Path, fragile: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Starting Ray takes ten seconds and more, so one test says all."""
-    for k in range(4):
+    """Starting Ray takes most of it, so one test says all; one CPU, for each worker loads what the command loads."""
+    for k in range(2):
         trimesh.creation.box([0.1, 0.05 + 0.01 * k, 0.03]).export(tmp_path / f"box_{k}.ply")
-    with ray_cluster(2):
+    with ray_cluster(1):
         words = ["meshes", "onboard", str(tmp_path), "--views", "4", "--out", str(tmp_path / "ray")]
         assert main([*words, "--ray"]) == 0
-        assert "4 meshes stored" in capsys.readouterr().out
+        assert "2 meshes stored" in capsys.readouterr().out
         # A task that dies costs its job and no other; what the cluster has not is refused.
-        assert dict(on_cluster(fragile, [5, 6, 7, 8], 2)) == {5: 25, 6: 36, 7: None, 8: 64}
+        assert dict(on_cluster(fragile, [6, 7, 8], 1)) == {6: 36, 7: None, 8: 64}
         with pytest.raises(ValueError, match="fault of the code"):
-            list(on_cluster(fragile, [1, -1], 2))
+            list(on_cluster(fragile, [1, -1], 1))
         with pytest.raises(UserError, match="--gpus 1 is more than the 0"):
-            list(on_cluster(fragile, [1], 2, gpus=1))
+            list(on_cluster(fragile, [1], 1, gpus=1))
     again = onboard(find_sources(tmp_path), tmp_path / "one", settings=ViewSettings(count=4))
-    assert len(again.stored) == 4
+    assert len(again.stored) == 2
     ray, one = (MeshStore.open(tmp_path / name).index() for name in ("ray", "one"))
     assert ray.keys == one.keys
     np.testing.assert_array_equal(ray.summary, one.summary)
