@@ -98,6 +98,7 @@ _VECTOR = """## Many at once
 
 `gym.make_vec("vid2demo:PandaPour-v0", num_envs=16, ...)` takes the same arguments and gives, for equal seeds and
 actions, bit for bit what single environments give, whatever `num_threads` (one per processor unless given).
+`reference` may be a list with one for each environment.
 `autoreset_mode` is `NextStep` (default), `SameStep` (`infos` then holds `final_obs` and `final_info`) or `Disabled`
 (reset what has ended with `options={"reset_mask": ...}`). Seeds, infos, `call`, `get_attr`, `set_attr` and `render` are
 as in `SyncVectorEnv`.

@@ -38,6 +38,7 @@ class _Turn(NamedTuple):
 class PandaVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
     """`num_envs` `PandaPourEnv`s, made from the same arguments, in Gymnasium's vector interface.
 
+    reference: as `PandaPourEnv`'s, or a list with one for each environment.
     num_threads: how many of them are simulated at a time; None takes one per processor. Results do not depend on it.
     autoreset_mode: `AutoresetMode` or its value. NextStep: the step after an episode's last begins the next one, its
         action is ignored. SameStep: an episode's last step begins the next one; `infos` holds `final_obs` and
@@ -69,8 +70,8 @@ class PandaVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
         except ValueError:
             valid = ", ".join(mode.value for mode in AutoresetMode)
             raise UserError(f"autoreset_mode is {autoreset_mode!r}; choose {valid}") from None
-        first = self.env_class(**arguments)
-        self.envs = [first, *(first.twin() for _ in range(self.num_envs - 1))]
+        self.envs = self._made(arguments)
+        first = self.envs[0]
         self._crew = Crew(threads)
         # Graphics contexts and windows belong to one thread.
         self._is_seen = first.obs_mode != "state" or first.render_mode == "human"
@@ -184,6 +185,15 @@ class PandaVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
         return self.get_attr("np_random_seed")
 
     # ------------------------------------------------------------------ inside
+
+    def _made(self, arguments: Mapping[str, Any]) -> list[PandaPourEnv]:
+        given = arguments.get("reference")
+        if not isinstance(given, list | tuple):
+            first = self.env_class(**arguments)
+            return [first, *(first.twin() for _ in range(self.num_envs - 1))]
+        if len(given) != self.num_envs:
+            raise UserError(f"{len(given)} references were given to {self.num_envs} environments; give one each")
+        return [self.env_class(**{**arguments, "reference": reference}) for reference in given]
 
     def _each(self, job: Any, numbers: Sequence[int]) -> list[Any]:
         return [job(i) for i in numbers] if self._is_seen else self._crew.run(job, numbers)

@@ -2,7 +2,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from vid2demo.demos.scale_search import ENOUGH, search_scale, tipped_further, with_receptacle_moved
+from vid2demo.demos.retarget import retarget
+from vid2demo.demos.scale_search import (
+    ENOUGH,
+    MOST_TRIES,
+    pours,
+    search_scale,
+    tipped_further,
+    with_receptacle_moved,
+)
 from vid2demo.envs.builtin import builtin_reference
 from vid2demo.envs.reference import Reference
 from vid2demo.extract.errors import UserError
@@ -53,11 +61,46 @@ def test_what_is_tipped_too_little_is_tipped_further(faithful: Reference, less_d
     assert np.rad2deg(found.tilt_rad.max() - little.tilt_rad.max()) == pytest.approx(chosen["tip_deg"], abs=1e-6)
 
 
-@pytest.mark.slow
-def test_equal_input_equal_choice(faithful: Reference) -> None:
+def test_the_choice_does_not_depend_on_the_number_of_threads(faithful: Reference) -> None:
     aside = with_receptacle_moved(faithful, 0.09, 0.0)
-    first, second = (search_scale(aside, no_other).header["scale_search"] for _ in range(2))
-    assert first == second
+    first, second = (search_scale(aside, no_other, num_threads=threads) for threads in (1, 3))
+    assert len(first.header["scale_search"]) > 1
+    assert first.header["scale_search"] == second.header["scale_search"]
+    np.testing.assert_array_equal(first.T_world_receptacle, second.T_world_receptacle)
+
+
+@pytest.mark.slow
+def test_pours_side_by_side_come_out_as_each_alone(faithful: Reference) -> None:
+    motions = []
+    for reference in (faithful, with_receptacle_moved(faithful, 0.09, 0.0), tipped_further(faithful, -25.0)):
+        motions.append((reference, retarget(reference)))
+    # One that takes longer must not lose what the others pour meanwhile.
+    slow = faithful.stretched(1.3)
+    motions.append((slow, retarget(slow)))
+    together = pours(motions, num_threads=2)
+    assert together == [pours([motion])[0] for motion in motions]
+    assert len({fractions for fractions in together if fractions is not None}) >= 3
+
+
+def test_a_smaller_path_is_tried_where_no_place_catches_all(faithful: Reference) -> None:
+    missed = with_receptacle_moved(faithful, 0.25, 0.0)
+    asked = []
+
+    def at_scale(scale: float) -> Reference:
+        asked.append(scale)
+        if scale < 0.8:
+            raise UserError(f"scale {scale:.2f} does not fit")
+        return faithful.with_header(scale=scale)
+
+    found = search_scale(missed, at_scale)
+    tried = found.header["scale_search"]
+    assert asked == [0.85, 0.7]  # each placed once
+    assert {t["scale"] for t in tried} == {1.0, 0.85}
+    chosen = next(t for t in tried if t["chosen"])
+    assert chosen["scale"] == 0.85
+    assert found.scale == 0.85
+    assert "the path scaled by 0.85" in found.notes[-1]
+    assert len(tried) <= MOST_TRIES
 
 
 def test_tipping_further_leaves_the_outlet_and_the_upright_start_where_they_were(faithful: Reference) -> None:

@@ -222,6 +222,25 @@ def test_gymnasiums_vector_wrappers_take_it(mug_pour: Reference) -> None:
 # ---------------------------------------------------------------------- its own promises
 
 
+def test_every_environment_may_have_a_reference_of_its_own(mug_pour: Reference) -> None:
+    short = mug_pour.stretched(0.5)
+    vector = PandaPourVectorEnv(2, reference=[short, mug_pour], num_particles=FEW)
+    singles = [PandaPourEnv(reference, num_particles=FEW) for reference in (short, mug_pour)]
+    observations, _ = vector.reset(seed=3)
+    for i, single in enumerate(singles):
+        assert equal(row(observations, i), single.reset(seed=3 + i)[0])
+    assert [env._max_episode_steps for env in vector.envs] == [env._max_episode_steps for env in singles]
+    for action in actions_near(singles[0], 5, 2):
+        observations, rewards, *_ = vector.step(action)
+        for i, single in enumerate(singles):
+            observation, reward, *_ = single.step(action[i])
+            assert equal(row(observations, i), observation)
+            assert rewards[i] == reward
+    vector.close()
+    with pytest.raises(UserError, match="2 references were given to 3 environments"):
+        PandaPourVectorEnv(3, reference=[short, mug_pour])
+
+
 def test_results_do_not_depend_on_the_number_of_threads(mug_pour: Reference) -> None:
     arguments = {"reference": mug_pour, "num_particles": FEW, "randomization": "high", "control_mode": "joint_delta"}
     made = [PandaPourVectorEnv(5, num_threads=threads, **arguments) for threads in (1, 2, 5)]
