@@ -15,6 +15,7 @@ import numpy as np
 from .background import Background
 from .camera_motion import CameraWatch
 from .cuts import CutWatch
+from .depth_video import DepthVideo, DepthView
 from .follow import Followed
 from .geometry import Array, projected_box
 from .progress import Progress
@@ -28,13 +29,22 @@ TRIAL_MARGIN = 0.1  # of mean confidence by the outline, by which the one that l
 
 @dataclass(frozen=True)
 class Clip:
-    """A video and where in it to start. rgb: the start frame at working size, that of camera_matrix and background."""
+    """A video and where in it to start. rgb: the start frame at working size, that of camera_matrix and background.
+
+    depth: of its frames, where a depth camera filmed as well.
+    """
 
     info: VideoInfo
     start_index: int
     rgb: Image
     camera_matrix: Array
     background: Background | None = None
+    depth: DepthVideo | None = None
+
+    def depth_of(self, index: int) -> DepthView | None:
+        """What the depth camera saw in a frame, if there is one."""
+        size_px = self.rgb.shape[1], self.rgb.shape[0]
+        return None if self.depth is None else self.depth.view(index, self.camera_matrix, size_px)
 
 
 @dataclass
@@ -63,8 +73,9 @@ def settle_rivals(clip: Clip, starts: Sequence[Start]) -> list[Start]:
             away = abs(frame.index - clip.start_index)
             if away > TRIAL_FRAMES:
                 break
+            depth = clip.depth_of(frame.index)
             for key, follower in trials.items():
-                follower.step(frame.rgb, away, TRIAL_FRAMES)
+                follower.step(frame.rgb, away, TRIAL_FRAMES, depth)
                 # Texture holds on to any shape: only the outline tells whether it is the right one.
                 sure.setdefault(key, []).append(replace(follower.tracker.signs, rigid=0.0).confidence)
 
@@ -130,16 +141,18 @@ def _pass(
         elif watched.camera is not None:
             watched.camera.step(frame.rgb, boxes=[b for f in forward if (b := _box(f, frame.index)) is not None])
         if frame.index >= start:
+            depth = clip.depth_of(frame.index)
             for follower in forward:
-                follower.step(frame.rgb, frame.index - (start if chained else 0), count)
+                follower.step(frame.rgb, frame.index - (start if chained else 0), count, depth)
             progress(frame.index + 1 - start, count, words)
     if start == 0:
         return forward
     backward = [make() for make in begin]
     before = [watched.times[k] for k in range(start + 1)]
     for frame in iterate_backward(clip.info.path, before, WORKING_SIDE_PX):
+        depth = clip.depth_of(frame.index)
         for follower in backward:
-            follower.step(frame.rgb, start - frame.index if chained else frame.index, count)
+            follower.step(frame.rgb, start - frame.index if chained else frame.index, count, depth)
         progress(count - frame.index, count, words)
     return [_joined(b, f, start) for b, f in zip(backward, forward, strict=True)]
 

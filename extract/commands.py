@@ -44,6 +44,11 @@ class FromVideo(Staged):
     mask: Annotated[Path | None, told("PNG", "The object in the start frame, white on black. Default: cut.")] = None
     start_frame: Annotated[int | None, told("N", "Frame of box and mask; followed both ways. Default: chosen.")] = None
     camera_motion: Annotated[Literal["auto", "static", "moving"], arg(help="Whether the camera moves.")] = "auto"
+    depth: Annotated[
+        Path | None,
+        told("PATH", "Depth pictures aligned to the frames: a folder of 16-bit PNGs, or one .npy. Default: none."),
+    ] = None
+    depth_scale: Annotated[float, arg(metavar="MM", help="Depth that one step of --depth stands for [mm].")] = 1.0
     rerun: Annotated[bool, told(None, "Write extract.rrd as well, for the Rerun viewer.")] = False
     method: Annotated[
         Literal["region", "freepose"], arg(help="By outline, colour and texture; or the paper's way, by views.")
@@ -73,6 +78,8 @@ class FromVideo(Staged):
             camera=self.camera,
             start_frame=self.start_frame,
             camera_motion=self.camera_motion,
+            depth=self.depth,
+            depth_scale_mm=self.depth_scale,
             rerun=self.rerun,
             seed=self.seed,
             method=self.method,
@@ -154,6 +161,7 @@ class Synthesize(Staged):
     fps: Annotated[float, arg(metavar="HZ", help="Frame rate [Hz].")] = 25.0
     size: Annotated[tuple[int, int], arg(metavar="W H", help="Size of the picture [px], even numbers.")] = (640, 480)
     without_hand: Annotated[bool, told(None, "Leave out the hand that hides a part of the vessel.")] = False
+    depth: Annotated[bool, told(None, "Write a depth camera's pictures as well: depth/*.png, in mm.")] = False
     seed: Seed = 0
 
     def do(self) -> Result:
@@ -161,6 +169,7 @@ class Synthesize(Staged):
 
         settings = {"category": self.category, "receptacle": self.receptacle, "seed": self.seed, "size": self.size}
         settings |= {"seconds": self.seconds, "fps": self.fps, "occluder": not self.without_hand}
+        settings |= {"depth": True} if self.depth else {}
         return self.do_stages([synthesize_stage(self.out, settings)], settings)
 
 

@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from .background import Background
+from .depth_size import scaled_vessel, size_of_clip
+from .depth_video import DepthView
 from .first_pose import edge_score
 from .geometry import Array, Symmetry, invert_pose
 from .raster import render_depth
@@ -38,7 +40,7 @@ SURE = 0.5  # least confidence of a frame that the shape may be fitted to
 @dataclass(frozen=True)
 class Glimpse:
     """What is kept of a frame: at half size how object-coloured it is and where it has edges, (H, W) both, see
-    `turn_scores`; and, of some frames, all that a shape fit needs."""
+    `turn_scores`; and, of some frames, all that a shape fit needs, and the depth if there is any."""
 
     index: int
     evidence: NDArray[np.float32]
@@ -46,6 +48,7 @@ class Glimpse:
     bins: NDArray[np.int32] | None = None
     edges: NDArray[np.float32] | None = None
     colours: ColourModel | None = None
+    depth: DepthView | None = None
 
 
 @dataclass
@@ -82,20 +85,20 @@ class Followed:
         tracker = ObjectTracker(mesh, camera_matrix, rgb, mask, T_camera_object, symmetry, background)
         return Followed(mesh, vessel, camera_matrix, mask, tracker, guesses)
 
-    def step(self, rgb: Image, index: int, frame_count: int) -> None:
-        """Take the next frame."""
+    def step(self, rgb: Image, index: int, frame_count: int, depth: DepthView | None = None) -> None:
+        """Take the next frame, and its depth where there is a depth camera."""
         before = None if self.first_look is None else self.first_look[min(index, len(self.first_look) - 1)]
         if before is not None and before.confidence >= SURE:
             self.estimates.append(before)
             return
         guess = None if self.guesses is None else self.guesses[min(index, len(self.guesses) - 1)]
-        now = self.tracker.step(rgb, guess)
+        now = self.tracker.step(rgb, guess, depth)
         self.estimates.append(now if before is None or now.confidence > before.confidence else before)
         stride = max(1, frame_count // GLIMPSES)
         if self.guesses is None and self.vessel is not None and index % stride == 0:
-            self.glimpses.append(self._glimpse(rgb, index, whole=len(self.glimpses) % WHOLE_EVERY == 0))
+            self.glimpses.append(self._glimpse(rgb, index, depth, whole=len(self.glimpses) % WHOLE_EVERY == 0))
 
-    def _glimpse(self, rgb: Image, index: int, whole: bool) -> Glimpse:
+    def _glimpse(self, rgb: Image, index: int, depth: DepthView | None, whole: bool) -> Glimpse:
         bins, edges, colours = colour_bins(rgb), edge_strength(rgb), self.tracker.colours
         evidence = object_evidence(bins, colours)
         strength = np.minimum(np.linalg.norm(edges, axis=-1), 1.0)
@@ -108,7 +111,7 @@ class Followed:
         evidence, near_edge = evidence[::2, ::2], near_edge[::2, ::2]
         if not whole:
             return Glimpse(index, evidence, near_edge)
-        return Glimpse(index, evidence, near_edge, bins, edges, colours.copy())
+        return Glimpse(index, evidence, near_edge, bins, edges, colours.copy(), depth)
 
     def second_pass(self, first_rgb: Image) -> Followed:
         """The same object before the first frame again, with spin and shape settled."""
@@ -122,6 +125,7 @@ class Followed:
         poses = _between_sure(poses, np.array([e.visible for e in self.estimates]))
         poses = self._with_settled_spin(poses, vessel)
         vessel, poses = self._fitted(poses, vessel)
+        vessel, poses = self._sized(poses, vessel)
         if vessel is not self.vessel:
             # A handle of the right size shows its side in frames where one of the wrong size did not.
             mesh, poses = tracking_mesh(vessel), self._with_settled_spin(poses, vessel, SECOND_LOOK_RAD)
@@ -183,6 +187,17 @@ class Followed:
         turns[:, 2] = np.median(turns[:, 2])
         shifts[:, :3, :3] = Rotation.from_rotvec(turns).as_matrix()
         return fitted, poses @ _between(shifts, np.array([g.index for g in chosen]), len(poses))
+
+    def _sized(self, poses: Array, vessel: Vessel) -> tuple[Vessel, Array]:
+        """The vessel as large as the depth pictures say, and its poses as far away; unchanged without any."""
+        told = [g for g in self.glimpses if g.depth is not None and self.estimates[g.index].confidence > SURE]
+        seen = [(poses[g.index], g.depth) for g in told if g.depth is not None]
+        ratio = size_of_clip(tracking_mesh(vessel), seen)
+        if ratio is None:
+            return vessel, poses
+        poses = poses.copy()
+        poses[:, :3, 3] *= ratio
+        return scaled_vessel(vessel, ratio), poses
 
     def _merit(self, mesh: TrackingMesh, poses: list[Array], glimpses: list[Glimpse]) -> float:
         """Mean over the views of the share of object colours covered and of the outline on image edges."""

@@ -19,6 +19,8 @@ from .camera_motion import CameraWatch
 from .candidates import Model, vessel_model
 from .candidates import ObjectRequest as ObjectRequest
 from .candidates import candidate_models as candidate_models
+from .depth_size import sized
+from .depth_video import DepthVideo
 from .detect import find_object, motion_since
 from .errors import UserError
 from .files import atomic_path
@@ -46,7 +48,10 @@ OTHER_FRAMES = (45,)  # looked at when what was found in the first cannot be fol
 
 @dataclass(frozen=True)
 class _Scene:
-    """The video with its camera at full, starting and working size; frames spread over it, and their background."""
+    """The video with its camera at full, starting and working size; frames spread over it, and their background.
+
+    depth: of its frames, where a depth camera filmed as well.
+    """
 
     info: VideoInfo
     camera_matrix: Array
@@ -54,6 +59,7 @@ class _Scene:
     scale: float
     samples: Sequence[Image]
     background: Background | None
+    depth: DepthVideo | None = None
 
     def camera(self, scale: float) -> Array:
         return np.asarray(np.diag([scale, scale, 1.0]) @ self.camera_matrix)
@@ -84,6 +90,8 @@ def extract(
     camera: tuple[float, float, float, float] | None = None,
     start_frame: int | None = None,
     camera_motion: Literal["auto", "static", "moving"] = "auto",
+    depth: Path | None = None,
+    depth_scale_mm: float = 1.0,
     rerun: bool = False,
     seed: int = 0,
     progress: Progress | None = None,
@@ -97,8 +105,10 @@ def extract(
     object, the others are receptacles.  start_frame: what boxes and masks belong to; when None the first, or another
     that shows the objects better where nobody pointed at them.  camera_motion: "static" does not look whether the
     camera moves; "moving" takes it to turn even where that explains only a part of what is seen.
+    depth: folder or array of depth pictures aligned to the frames, a step of which is depth_scale_mm (depth_video.py);
+    sizes of vessels and distances are then measured instead of guessed.
     progress: called with (done, total, what).
-    Raises UserError for a bad video, box, mask, name or mesh, and when an object cannot be found.
+    Raises UserError for a bad video, box, mask, name, mesh or depth, and when an object cannot be found.
     """
     report = progress or (lambda done, total, what: None)
     if rerun:
@@ -115,7 +125,8 @@ def extract(
     report(0, info.frame_count, "looking for " + " and ".join(request.name for request in requests))
     samples = [frame.rgb for frame in sample_frames(info, SAMPLES, WORKING_SIDE_PX)]
     background = None if camera_motion == "moving" else learn_background(samples)
-    scene = _Scene(info, camera_matrix, start_scale, scale, samples, background)
+    filmed = None if depth is None else DepthVideo.open(depth, info, depth_scale_mm)
+    scene = _Scene(info, camera_matrix, start_scale, scale, samples, background, filmed)
     attempts: list[_Attempt] = []
     for index, sharp, starts in _found(scene, requests, models, start_frame):
         attempts.append(_attempt(scene, index, sharp, starts, report, camera_motion != "static"))
@@ -186,8 +197,10 @@ def write_tracks(
 def _attempt(
     scene: _Scene, index: int, sharp: Image, starts: list[Start], report: Progress, watch_camera: bool
 ) -> _Attempt:
-    clip = Clip(scene.info, index, _small(sharp, scene), scene.camera(scene.scale), scene.background)
-    starts = [sharpened(start, sharp, scene.camera(scene.start_scale)) for start in settle_rivals(clip, starts)]
+    clip = Clip(scene.info, index, _small(sharp, scene), scene.camera(scene.scale), scene.background, scene.depth)
+    near = clip.depth_of(index)
+    starts = settle_rivals(clip, [sized(start, near) for start in starts])
+    starts = [sized(sharpened(start, sharp, scene.camera(scene.start_scale)), near) for start in starts]
     followed, watched = follow_both_ways(clip, starts, report, watch_camera=watch_camera)
     return _Attempt(scene, sharp, index, starts, followed, watched)
 
@@ -379,6 +392,7 @@ def _header(request: ObjectRequest, scene: _Scene, start: Start, model: Model, i
             "start_frame": index,
             "working_side_px": WORKING_SIDE_PX,
             "first_frame": start.described(),
+            **({} if scene.depth is None else {"depth": scene.depth.described(model.vessel is not None)}),
         },
     }
 

@@ -47,6 +47,7 @@ class VideoSettings:
 
     camera: (fx, fy, cx, cy) in px, or None: the focal prior.
     start_frame: the frame that boxes and masks belong to, or None: the first, or the best where none are given.
+    depth: folder or array of depth pictures, a step of which is depth_scale_mm; None without a depth camera.
     rerun: whether to write extract.rrd.
     method: "region" follows outline, colour and texture; "freepose" goes the paper's way. Of that: translation, one of
     "coarse", "pnp" and "fused", None for the last; level and models_dir, which networks do the seeing.
@@ -58,6 +59,8 @@ class VideoSettings:
     camera: tuple[float, float, float, float] | None = None
     start_frame: int | None = None
     camera_motion: Literal["auto", "static", "moving"] = "auto"
+    depth: Path | None = None
+    depth_scale_mm: float = 1.0
     rerun: bool = False
     seed: int = 0
     method: Literal["region", "freepose"] = "region"
@@ -70,6 +73,10 @@ class VideoSettings:
             raise UserError("--translation, --level and --models-dir belong to --method freepose; add that")
         if self.method == "freepose" and self.camera_motion == "moving":
             raise UserError("--method freepose takes the camera to stand still; leave out --camera-motion moving")
+        if self.method == "freepose" and self.depth is not None:
+            raise UserError("--method freepose reads no depth pictures; leave out --depth or --method freepose")
+        if self.depth is None and self.depth_scale_mm != 1.0:
+            raise UserError(f"--depth-scale {self.depth_scale_mm:g} belongs to --depth PATH; add that")
 
 
 def video_identity(path: Path) -> dict[str, Any]:
@@ -96,7 +103,10 @@ def synthesize_stage(folder: Path, settings: Mapping[str, Any]) -> Stage:
         return {"frames": len(clip.truth), "boxes_xywh_px": clip.boxes_xywh_px}
 
     outputs = ("video.mp4", "truth.track.npz", "receptacle.track.npz", "settings.json")
-    return Stage("synthesize", "render a clip with exact truth", work, plain(settings), {}, outputs, ("extract",))
+    depth = ("depth",) if settings.get("depth") else ()
+    return Stage(
+        "synthesize", "render a clip with exact truth", work, plain(settings), {}, (*outputs, *depth), ("extract",)
+    )
 
 
 def extract_stage(settings: VideoSettings, folder: Path) -> Stage:
@@ -118,6 +128,7 @@ def extract_stage(settings: VideoSettings, folder: Path) -> Stage:
         else:
             from .perceive import extract
 
+            shared |= {"depth": settings.depth, "depth_scale_mm": settings.depth_scale_mm}
             tracks = extract(settings.video, requests, camera_motion=settings.camera_motion, **shared)
         return {name: _track_figures(track) for name, track in tracks.items()}
 
@@ -128,8 +139,11 @@ def extract_stage(settings: VideoSettings, folder: Path) -> Stage:
     told |= {"start_frame": settings.start_frame, "camera_motion": settings.camera_motion, "seed": settings.seed}
     if settings.method != "region":
         told |= {name: getattr(settings, name) for name in ("method", "translation", "level", "models_dir")}
+    if settings.depth is not None:
+        told["depth_scale_mm"] = settings.depth_scale_mm
     files = {f"mesh of {o.name}": o.mesh for o in objects if o.mesh is not None}
     files |= {f"mask of {o.name}": o.mask for o in objects if o.mask is not None}
+    files |= {"depth": settings.depth} if settings.depth is not None else {}
     outputs = [f"{o.name}.{kind}" for o in objects for kind in ("track.npz", "masks.npz", "mask.png")]
     outputs += ["overlay.mp4", *(["extract.rrd"] if settings.rerun else [])]
     return Stage(
@@ -162,6 +176,9 @@ def _track_figures(track: Any) -> dict[str, Any]:
     camera = track.header["camera"]
     if camera["motion"]["kind"] != "static":
         figures["camera"] = camera["motion"]["kind"]
+    if "depth" in how:
+        sized = "sizes and distances" if how["depth"]["size_source"] == "depth" else "distances"
+        figures["depth"] = f"{sized} measured by {how['depth']['file']}"
     if camera.get("source") == "estimated":
         figures["focal_length"] = f"{camera['focal_px']:g} px, give or take {camera['std_px']:g}, told by the clip"
     faces = mesh.get("faces", {})

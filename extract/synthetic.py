@@ -7,6 +7,7 @@ pixel is (0.5, 0.5) and the principal point of the renderer is exactly (width / 
 from __future__ import annotations
 
 import hashlib
+import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,10 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import UserError
-from .files import write_json
+from .files import atomic_path, write_json
 from .geometry import Array, invert_pose
 from .offscreen import load_mujoco
 from .progress import Progress
+from .synthetic_depth import sensed_depth
 from .synthetic_hand import Grip, grips
 from .synthetic_motion import Camera, PourPath, PourShape, place_camera, plan_pour
 from .synthetic_scene import OBJECT, RECEPTACLE, Scene
@@ -33,6 +35,7 @@ from .video import VideoWriter, read_video_info
 SCHEMA = "vid2demo/synthetic-clip"
 VISIBLE_FRACTION = 0.1
 ENOUGH_VISIBLE = 0.5
+DEPTH_FOLDER = "depth"
 MAX_FRAMES = 3000
 MAX_SIDE_PX = 1920
 MIN_SIDE_PX = 64
@@ -72,13 +75,15 @@ def synthesize(
     size: tuple[int, int] = (640, 480),
     occluder: bool = True,
     noise: bool = True,
+    depth: bool = False,
     progress: Progress | None = None,
 ) -> SyntheticClip:
     """Render a seeded pour into `out`: video.mp4, truth.track.npz, receptacle.track.npz and settings.json.
 
     category, receptacle: library vessels (a word that names several, such as "kettle", draws one of them).
     size: (width, height) in px, even.  occluder: a hand and forearm.  noise: sensor noise, blur and white balance;
-    the video is compressed either way. Equal arguments give equal poses and equal pictures on one machine.
+    the video is compressed either way.  depth: also write the pictures of a depth camera at the same place, in mm, with
+    its noise and holes, to the folder `depth`. Equal arguments give equal poses and equal pictures on one machine.
     Raises UserError for an unknown category, an impossible size, length or rate.
     """
     _check(seconds, fps, size)
@@ -100,12 +105,17 @@ def synthesize(
     visible = np.zeros(count)
     boxes: dict[str, list[int] | None] = {}
     scene_seed = int(rng.integers(1 << 31))
+    depth_rng = np.random.default_rng([seed, 1])  # its own, so that the pictures are the same without it
+    if depth:
+        shutil.rmtree(out / DEPTH_FOLDER, ignore_errors=True)  # of a longer clip
     choices: list[Grip | None] = [*grips(rng, vessel.grasps)] if occluder else [None]
     with _scene(scene_seed, vessel, bowl, path, camera, size, choices) as scene, VideoWriter(video, fps) as writer:
         notes = scene.notes
         for k in range(count):
             picture = scene.render(k)
             writer.write(sensor.expose(picture, rng) if sensor else picture)
+            if depth:
+                _write_depth(out / DEPTH_FOLDER / f"{k:06d}.png", sensed_depth(scene.depth(k), depth_rng))
             visible[k] = scene.visible_fraction(k)
             if k == 0:
                 labels = scene.labels(k)
@@ -127,6 +137,7 @@ def synthesize(
         "image_size_px": list(size),
         "occluder": occluder,
         "noise": noise,
+        "depth": depth,
         "versions": {"mujoco": load_mujoco().__version__, "numpy": np.__version__, "opencv": cv2.__version__},
         "boxes_xywh_px": boxes,
         "camera_matrix": camera.camera_matrix.tolist(),
@@ -255,6 +266,11 @@ def _track(
         visible=visible_fraction > VISIBLE_FRACTION,
         header={"object": name, "mesh": mesh, **common},
     )
+
+
+def _write_depth(path: Path, depth_mm: NDArray[np.uint16]) -> None:
+    with atomic_path(path) as temporary:
+        cv2.imwrite(str(temporary), depth_mm)
 
 
 def _box_of(mask: NDArray[np.bool_]) -> list[int] | None:

@@ -55,6 +55,11 @@ class Scene(Studio):
         self._pose(k)
         return self.picture()
 
+    def depth(self, k: int) -> NDArray[np.float32]:
+        """(H, W) exact depth of frame k in m, along the camera's z."""
+        self._pose(k)
+        return self.depth_m()
+
     def labels(self, k: int, only: int | None = None) -> NDArray[np.int8]:
         """(H, W) class of every pixel of frame k: SCENERY, OBJECT, RECEPTACLE or HAND; `only` hides the others."""
         self._pose(k)

@@ -9,6 +9,7 @@ from typing import Any, Self
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from .geometry import Array
@@ -74,6 +75,17 @@ class Studio:
         option.geomgroup[:] = 1  # by default MuJoCo hides groups from 3 on
         self._renderer.update_scene(self._data, camera="camera", scene_option=option)
         return np.array(self._renderer.render())
+
+    def depth_m(self) -> NDArray[np.float32]:
+        """(H, W) exact depth along the camera's z in m."""
+        self._renderer.disable_segmentation_rendering()
+        self._renderer.enable_depth_rendering()
+        option = self._mujoco.MjvOption()
+        option.geomgroup[:] = 1
+        self._renderer.update_scene(self._data, camera="camera", scene_option=option)
+        drawn = np.array(self._renderer.render(), np.float32)
+        self._renderer.disable_depth_rendering()
+        return drawn
 
     def _lamps(self) -> None:
         rng, spec = self._rng, self._spec

@@ -1,6 +1,7 @@
 """Follow one object from frame to frame: predict, refine against the frame, learn from it, judge the result.
 
-The outline against learned colours (region.py) and textured points (texture.py) move the pose in one least squares.
+The outline against learned colours (region.py), textured points (texture.py) and, where there are any, depth pictures
+(depth_term.py) move the pose in one least squares.
 Only the part of the frame around the prediction is looked at; the whole of it when the object is lost.
 """
 
@@ -15,6 +16,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from .background import Background
+from .depth_term import Surface, draw_surface, settle
+from .depth_video import DepthView
 from .first_pose import share_on_edges
 from .geometry import Array, Symmetry, make_pose, project, transform_points
 from .raster import render_depth
@@ -113,6 +116,7 @@ class _Fit:
     matches: Matches = NO_MATCHES
     strain: float = 0.0
     signs: Signs = Signs(0.0, 0.0, 0.0)
+    farther: float = 1.0  # than outline and texture alone would have it, by the depth picture
 
 
 class ObjectTracker:
@@ -139,6 +143,9 @@ class ObjectTracker:
         self.background = background
         self.signs = Signs(0.0, 0.0, 0.0)
         self.textured_frames = 0
+        self._depth: DepthView | None = None
+        self._surface: Surface | None = None
+        self._farther = 1.0
         self._pose: Array = T_camera_object
         self._velocity: Array = np.zeros(6)
         self._lost_frames, self._size_px = 0, (rgb.shape[1], rgb.shape[0])
@@ -154,8 +161,12 @@ class ObjectTracker:
         part = self._around(rgb, T_camera_object)
         self.texture.keep(part.picture, part.camera_matrix, T_camera_object)
 
-    def step(self, rgb: Image, guess: Array | None = None) -> Estimate:
-        """Pose in the next frame, refined from where the motion so far leads or from `guess`, which is preferred."""
+    def step(self, rgb: Image, guess: Array | None = None, depth: DepthView | None = None) -> Estimate:
+        """Pose in the next frame, refined from where the motion so far leads or from `guess`, which is preferred.
+
+        depth: of the same frame, where there is a depth camera.
+        """
+        self._depth = depth
         ahead = self._predicted()
         start = ahead if guess is None else guess
         part = self._around(rgb, start)
@@ -192,7 +203,7 @@ class ObjectTracker:
             self._velocity = np.concatenate([turn, T[:3, 3] - self._pose[:3, 3]])
         else:
             self._velocity = np.zeros(6)
-        self._pose, self._lost_frames = T, 0
+        self._pose, self._lost_frames, self._farther = T, 0, fit.farther
         self.textured_frames += self._tells_spin(fit.matches)
         self.texture.judge(fit.matches, fit.strain)
         if fit.confidence >= LEARN_ABOVE and fit.outline is not None:
@@ -233,7 +244,10 @@ class ObjectTracker:
             prior_translation=0.02 * freedom, prior_depth=0.01 * freedom,
             edges=part.edges, points=matches.points, outline=self._outline,
         )  # fmt: skip
-        T, self._outline = result.T_camera_object, result.outline
+        self._outline = result.outline
+        T, farther = self._with_depth(
+            result.T_camera_object, result.information, STILL_SPIN_RAD if hidden_spin else 0.03
+        )
         outline = None if self._outline is None else self._outline.moved(T, part.camera_matrix).inside(part.shape)
         in_view = self._share_in_view(T)
         if in_view < 0.1 or outline is None:
@@ -251,7 +265,23 @@ class ObjectTracker:
         told = outline.select(part.bins[y, x] != HIDDEN_BIN)
         signs = Signs(agree, share_on_edges(told, part.edges), rigid)
         confidence = signs.confidence * min(1.0, 2 * in_view)
-        return _Fit(T, confidence, outline, matches, result.strain, signs)
+        return _Fit(T, confidence, outline, matches, result.strain, signs, farther)
+
+    def _with_depth(self, T: Array, information: Array, spin_rad: float) -> tuple[Array, float]:
+        """A pose of that information (6, 6) joined with what the depth picture says, and how much farther that is."""
+        if self._depth is None:
+            return T, 1.0
+        if self._surface is None or not self._surface.serves(T):
+            self._surface = draw_surface(self.mesh, T, self._depth.camera_matrix)
+        # What neither shows stays where it is: a body's spin above all.
+        up = T[:3, :3] @ np.asarray(self.symmetry.axis)
+        held = np.diag([1 / 0.03**2] * 3 + [1 / (0.02 * T[2, 3]) ** 2] * 3)
+        held[:3, :3] += np.outer(up, up) * (1 / spin_rad**2 - 1 / 0.03**2)
+        settled = None if self._surface is None else settle(self._surface, T, self._depth, information + held)
+        if settled is None:
+            # Where nothing was read the outline is as wrong about the distance as it was before.
+            return make_pose(T[:3, :3], T[:3, 3] * self._farther), self._farther
+        return settled, float(np.linalg.norm(settled[:3, 3]) / np.linalg.norm(T[:3, 3]))
 
     def _searched(self, part: _Part, best: _Fit, predicted: Array) -> _Fit:
         """The best of wider looks: around the prediction at first, then wherever the object's colours are."""
