@@ -157,34 +157,53 @@ def motion_rows(joints: JointTrajectory, *, clock: str = "") -> str:
 
 
 def tries_figure(tries: Sequence[Mapping[str, Any]]) -> str:
-    """A curve of what `--scale auto` tried, in its order: poured and spilled percent, the chosen one with large dots.
+    """What `--scale auto` tried: poured minus spilled percent over the receptacle's shift, a curve for every scale.
 
-    Below each stands its scale, how far the receptacle was moved and how much further the vessel was tipped.
+    Rings are tries with the receptacle moved sideways, the chosen try is a large dot, and what the arm cannot do stands
+    at -100. Under the pointer each tells its fractions.
     """
-    height, foot = HEIGHT + 26.0, 60.0
-    x = _LEFT + (np.arange(len(tries)) + 0.5) / len(tries) * (WIDTH - _LEFT - _RIGHT)
-    low, high = height - foot, _TOP + 6.0
+    height = HEIGHT + 20.0
+    most_cm = 1.1 * max(1.0, *(100.0 * abs(float(t["along_m"])) for t in tries))
+
+    def x(cm: Array | float) -> Array:
+        return _LEFT + (np.asarray(cm, float) / most_cm + 1.0) / 2.0 * (WIDTH - _LEFT - _RIGHT)
+
+    def y(score: Array | float) -> Array:
+        return height - _BOTTOM - (np.asarray(score, float) + 1.0) / 2.0 * (height - _TOP - 6.0 - _BOTTOM)
+
     parts = []
-    for tick in (0, 25, 50, 75, 100):
-        at = low + (high - low) * tick / 100
+    for tick in (-100, -50, 0, 50, 100):
+        at = float(y(tick / 100))
         parts.append(f'<path class="grid" d="M{_LEFT} {at:.1f}H{WIDTH - _RIGHT}"/>')
         parts.append(f'<text class="tick" x="{_LEFT - 6}" y="{at + 4:.1f}" text-anchor="end">{tick}</text>')
+    for shift in ticks(-most_cm, most_cm):
+        parts.append(
+            f'<text class="tick" x="{float(x(shift)):.1f}" y="{height - _BOTTOM + 16}" text-anchor="middle">'
+            f"{_number(shift)}</text>"
+        )
+    parts.append(
+        f'<text class="tick" x="{WIDTH - _RIGHT}" y="{height - 4}" text-anchor="end">receptacle moved along the pour '
+        "[cm]</text>"
+    )
+    motions: dict[str, list[Mapping[str, Any]]] = {}
+    for t in tries:
+        motions.setdefault("tipped further" if t["tip_deg"] else f"path ×{float(t['scale']):.2g}", []).append(t)
     keys = ""
-    for color, name in ((1, "poured"), (2, "spilled")):
-        y = low + (high - low) * np.array([float(t[name]) for t in tries])
-        parts.append(f'<path class="line" style="stroke:var(--line-{color})" d="{_path(x, y)}"/>')
-        for at, up, t in zip(x, y, tries, strict=True):
-            radius = 6 if t["chosen"] else 3
-            parts.append(f'<circle cx="{at:.1f}" cy="{up:.1f}" r="{radius}" style="fill:var(--line-{color})"/>')
-        keys += f'<span class="key"><i style="background:var(--line-{color})"></i>{name}</span>'
-    for at, t in zip(x, tries, strict=True):
-        moved_cm = 100.0 * math.hypot(float(t["along_m"]), float(t["across_m"]))
-        words = (f"×{float(t['scale']):.2g}", f"{moved_cm:.0f} cm", f"+{float(t['tip_deg']):.0f}°")
-        for row, text in enumerate(words):
+    for number, (label, made) in enumerate(motions.items()):
+        color = f"var(--line-{number + 1})"
+        along = sorted((t for t in made if not t["across_m"]), key=lambda t: float(t["along_m"]))
+        d = _path(x([100.0 * t["along_m"] for t in along]), y([t["score"] for t in along]))
+        parts.append(f'<path class="line" style="stroke:{color}" d="{d}"/>')
+        for t in made:
+            ring = f"stroke:{color};fill:none;stroke-width:2" if t["across_m"] else f"fill:{color}"
+            where = f'cx="{float(x(100.0 * t["along_m"])):.1f}" cy="{float(y(t["score"])):.1f}"'
+            what = f"{label}: {100 * t['poured']:.0f}% poured, {100 * t['spilled']:.0f}% spilled"
+            what += f", {t['tip_deg']:.0f}° further" if t["tip_deg"] else ""
             parts.append(
-                f'<text class="tick" x="{at:.1f}" y="{low + 18 + 14 * row:.1f}" text-anchor="middle">{text}</text>'
+                f'<circle {where} r="{7 if t["chosen"] else 3.5}" style="{ring}"><title>{what}</title></circle>'
             )
-    title = "pours tried: path scaled, receptacle moved, tipped further"
+        keys += f'<span class="key"><i style="background:{color}"></i>{label}</span>'
+    title = "pours tried: poured minus spilled"
     return (
         f"<figure><figcaption><b>{title}</b> <small>[%]</small> {keys}</figcaption>"
         f'<svg viewBox="0 0 {WIDTH:.0f} {height:.0f}" role="img" aria-label="{title}">{"".join(parts)}</svg></figure>'

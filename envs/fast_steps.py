@@ -1,6 +1,6 @@
 """The engine and the fast liquid in turn: many steps in one compiled call, during which other threads have Python.
 
-Compiled code calls the engine's C functions by their addresses; through Python every step would take an eighth longer,
+Compiled code calls the engine's C functions itself; through Python every step would take an eighth longer,
 and the threads of a vector environment would spend their time waiting for each other. An error of the engine would
 end the process here; a scene that has been compiled, and where only the arm touches anything, gives no cause for one.
 """
@@ -32,7 +32,7 @@ class Together:
         self._pose = data.xpos[vessel_id], data.xmat[vessel_id].reshape(3, 3)
         self._push = data.xfrc_applied[vessel_id], data.xipos[vessel_id]
         self._control = data.ctrl
-        self._engine = _STEP, _KINEMATICS, model._address, data._address
+        self._engine = model._address, data._address
         self._kept = model, data
 
     def advance(self, commands: Array, T_world_receptacle: Array) -> None:
@@ -43,22 +43,15 @@ class Together:
         _steps(*given, liquid.poses, liquid.wrench, liquid.arguments)
 
 
-class _EngineFunction(types.WrapperAddressProtocol):
+def _engine_function(name: str) -> Any:
     """A C function of the engine that takes the addresses of a model and a data, for compiled code to call."""
-
-    def __init__(self, name: str) -> None:
-        folder = Path(mujoco.__file__).parent
-        path = next(path for pattern in _LIBRARIES for path in folder.glob(pattern))
-        self._function = getattr(ctypes.CDLL(str(path)), name)
-
-    def __wrapper_address__(self) -> int:
-        return int(ctypes.cast(self._function, ctypes.c_void_p).value or 0)
-
-    def signature(self) -> Any:
-        return types.void(types.intp, types.intp)
+    return types.ExternalFunction(name, types.void(types.intp, types.intp))
 
 
-_STEP, _KINEMATICS = _EngineFunction("mj_step"), _EngineFunction("mj_kinematics")
+# Where the linker finds the engine's functions by their names, which is how cached code knows them.
+_path = next(path for pattern in _LIBRARIES for path in Path(mujoco.__file__).parent.glob(pattern))
+_library = ctypes.CDLL(str(_path), ctypes.RTLD_GLOBAL)
+_step, _kinematics = _engine_function("mj_step"), _engine_function("mj_kinematics")
 
 
 def _compiled(kernels_changed_ns: int) -> Any:
@@ -66,8 +59,6 @@ def _compiled(kernels_changed_ns: int) -> Any:
 
     @njit(cache=True, nogil=True, error_model="numpy")
     def steps(
-        step: Any,
-        kinematics: Any,
         model: int,
         data: int,
         commands: Array,
@@ -84,8 +75,8 @@ def _compiled(kernels_changed_ns: int) -> Any:
         for k in range(len(commands)):
             for j in range(commands.shape[1]):
                 control[j] = commands[k, j]
-            step(model, data)
-            kinematics(model, data)
+            _step(model, data)
+            _kinematics(model, data)
             poses[0, 0] = poses[0, 1]
             poses[0, 1, :3, :3], poses[0, 1, :3, 3] = R, position_m
             kernels.advance(*liquid)

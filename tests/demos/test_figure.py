@@ -126,18 +126,23 @@ def test_the_report_tells_what_is_left_to_each_limit() -> None:
     assert "125°/s to the limit" in html.replace("125 °/s", "125°/s")
 
 
-def test_the_curve_of_pours_tried_has_a_point_a_try_and_rings_the_chosen() -> None:
-    still = {"scale": 1.0, "along_m": 0.0, "across_m": 0.0, "tip_deg": 0.0}
+def test_the_curve_of_pours_tried_has_a_dot_a_try_and_a_line_a_scale() -> None:
+    still = {"scale": 1.0, "along_m": 0.0, "across_m": 0.0, "tip_deg": 0.0, "chosen": False}
     tries = [
-        {**still, "poured": 0.5, "spilled": 0.25, "chosen": False},
-        {**still, "scale": 0.85, "along_m": 0.03, "across_m": 0.04, "poured": 1.0, "spilled": 0.0, "chosen": True},
+        {**still, "poured": 0.5, "spilled": 0.5, "score": 0.0},
+        {**still, "along_m": 0.02, "poured": 0.0, "spilled": 1.0, "score": -1.0},
+        {**still, "scale": 0.85, "along_m": 0.02, "poured": 1.0, "spilled": 0.0, "score": 1.0, "chosen": True},
+        {**still, "scale": 0.85, "across_m": -0.02, "poured": 0.8, "spilled": 0.05, "score": 0.75},
     ]
-    root = ElementTree.fromstring(tries_figure(tries))
+    html = tries_figure(tries)
+    root = ElementTree.fromstring(html)
     circles = [c for c in root.iter() if c.tag.endswith("circle")]
-    assert [c.get("r") for c in circles] == ["3", "6", "3", "6"]
-    poured, _, spilled, _ = (float(c.get("cy", "nan")) for c in circles)
-    full, nothing = float(circles[1].get("cy", "nan")), float(circles[3].get("cy", "nan"))
-    assert poured == pytest.approx(0.5 * (full + nothing), abs=0.1)
-    assert spilled == pytest.approx(0.75 * nothing + 0.25 * full, abs=0.1)
-    words = [t.text for t in root.iter() if t.tag.endswith("text")]
-    assert words[-3:] == ["×0.85", "5 cm", "+0°"]
+    assert [c.get("r") == "7" for c in circles] == [False, False, True, False]
+    assert ["fill:none" in str(c.get("style")) for c in circles] == [False, False, False, True]
+    (x0, y0), (x1, y1), (x2, y2), (x3, y3) = ((float(c.get("cx", "nan")), float(c.get("cy", "nan"))) for c in circles)
+    assert x1 == x2 > x0 == x3
+    assert y0 == pytest.approx(0.5 * (y1 + y2), abs=0.1)
+    assert y3 == pytest.approx(y0 + 0.75 * (y2 - y0), abs=0.1)
+    assert len([p for p in root.iter() if p.tag.endswith("path") and p.get("class") == "line"]) == 2
+    assert "80% poured, 5% spilled" in html
+    assert all(f"path ×{scale}" in html for scale in ("1", "0.85"))
