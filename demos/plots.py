@@ -192,7 +192,8 @@ def tries_figure(tries: Sequence[Mapping[str, Any]]) -> str:
     for number, (label, made) in enumerate(motions.items()):
         color = f"var(--line-{number + 1})"
         along = sorted((t for t in made if not t["across_m"]), key=lambda t: float(t["along_m"]))
-        d = _path(x([100.0 * t["along_m"] for t in along]), y([t["score"] for t in along]))
+        where_cm, scores = (np.array([float(t[name]) for t in along]) for name in ("along_m", "score"))
+        d = _path(x(100.0 * where_cm), y(scores))
         parts.append(f'<path class="line" style="stroke:{color}" d="{d}"/>')
         for t in made:
             ring = f"stroke:{color};fill:none;stroke-width:2" if t["across_m"] else f"fill:{color}"
