@@ -25,43 +25,23 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
+from retrieval_baselines import by_moments
 from vid2demo.extract.bop import open_dataset
 from vid2demo.extract.bop_commands import SynthesizeBop
-from vid2demo.extract.bop_pose import large_enough
 from vid2demo.extract.features import ClassicalFeatures, features_of
 from vid2demo.extract.mesh_sources import find_sources, library_sources
 from vid2demo.extract.mesh_store import About, MeshStore
+from vid2demo.extract.neural_segment import FOR_IMAGES, large_enough
 from vid2demo.extract.onboarding import onboard
-from vid2demo.extract.protocols import Image, Mask, Proposal
+from vid2demo.extract.protocols import Image, Mask
 from vid2demo.extract.retrieval import Look, Retriever, look_at_object, vote
-from vid2demo.extract.segment import mask_box
-from vid2demo.extract.templates import ViewSettings, template_view
+from vid2demo.extract.templates import ViewSettings
 
 DATASET = Path("runs/tables")
 CLEAR = 0.95  # visible share from which on an object counts as unhidden
 SEARCHES = 15
-MOMENT_STEP = 3  # a third of the views serves moments as well, which know no turn of the picture
-
-
-def moments(mask: Mask) -> NDArray[np.float64]:
-    """(7,) logarithms of Hu's moments of a silhouette, which know neither place, size nor turn."""
-    hu = cv2.HuMoments(cv2.moments(mask.astype(np.uint8), binaryImage=True)).ravel()
-    return np.asarray(-np.sign(hu) * np.log10(np.abs(hu) + 1e-12))
-
-
-def by_moments(store: MeshStore, index_keys: tuple[str, ...]) -> Callable[[Mask], NDArray[np.float64]]:
-    """Scores of all objects by the view whose silhouette's moments are nearest."""
-    views = []
-    for key in index_keys:
-        mesh = store.mesh(key).mesh
-        some = range(0, store.settings.count, MOMENT_STEP)
-        views.append([moments(template_view(mesh, store.settings, k, 60).mask) for k in some])
-    table = np.array(views)
-    spread = table.reshape(-1, 7).std(axis=0)
-    return lambda mask: -np.linalg.norm((table - moments(mask)) / spread, axis=-1).min(axis=1)
 
 
 def rank(scores: NDArray[Any], categories: list[str], wanted: str) -> int:
@@ -85,7 +65,7 @@ def accuracy(dataset_folder: Path, db: Path | None) -> dict[str, Any]:
         rgb: Image = dataset.rgb(image)
         for there in dataset.objects(image):
             mask = dataset.mask(image, there.index)
-            if mask is None or not mask.any() or not large_enough(Proposal(mask, mask_box(mask), 1.0)):
+            if mask is None or not large_enough(mask, FOR_IMAGES):
                 continue
             start = time.process_time()
             look = look_at_object(features, store.settings.extend, [(rgb, mask)])
@@ -103,9 +83,10 @@ def accuracy(dataset_folder: Path, db: Path | None) -> dict[str, Any]:
 
         return scores
 
-    by_hu = by_moments(store, keys)
+    names, by_hu = by_moments(dataset_folder)
+    place = [names.index(about.name) for about in retrievers["summary"].abouts]
     methods: dict[str, Callable[[Mask, Look], NDArray[Any]]] = {
-        "silhouette moments, nearest view": lambda mask, look: by_hu(mask),
+        "silhouette moments, nearest view": lambda mask, look: by_hu(mask)[place],
         "FFA, one descriptor an object": by_views("average", 0),
         "FFA, best 2 views": by_views("average", 2),
         "summary, one descriptor an object": by_views("summary", 0),

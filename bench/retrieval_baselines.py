@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -39,19 +40,16 @@ def main() -> None:
         SynthesizeBop(out=folder).do()
     dataset = open_dataset(folder)
     true = json.loads((folder / CATEGORIES_FILE).read_text())
-    entries = json.loads((folder / DATABASE_FILE).read_text())
     begin_s = time.perf_counter()
-    views = np.stack([described(folder, entry["file"], arguments.views) for entry in entries])
-    spread = views.reshape(-1, views.shape[-1]).std(axis=0)
-    categories = np.array([entry["category"] for entry in entries])
-    print(f"{len(entries)} meshes in {arguments.views} views: {time.perf_counter() - begin_s:.1f} s")
+    names, score = by_moments(folder, arguments.views)
+    print(f"{len(names)} meshes in {arguments.views} views: {time.perf_counter() - begin_s:.1f} s")
+    categories = np.array([entry["category"] for entry in json.loads((folder / DATABASE_FILE).read_text())])
     first, fifth = [], []
     for image, truths in targets_of(dataset).items():
         for truth in truths:
             mask = dataset.mask(image, truth.index)
             assert mask is not None
-            off = np.linalg.norm((views - moments(mask)) / spread, axis=-1).min(axis=1)
-            best = categories[np.argsort(off)[:5]]
+            best = categories[np.argsort(-score(mask))[:5]]
             first.append(best[0] == true[str(truth.obj_id)])
             fifth.append(true[str(truth.obj_id)] in best)
     figures = {"category_percent": 100 * np.mean(first), "category_top5_percent": 100 * np.mean(fifth)}
@@ -59,6 +57,15 @@ def main() -> None:
         f"{len(first)} objects: top-1 {figures['category_percent']:.1f}%, top-5 {figures['category_top5_percent']:.1f}%"
     )
     write_json(arguments.out, {"figures": {name: float(value) for name, value in figures.items()}})
+
+
+def by_moments(folder: Path, count: int = 200) -> tuple[list[str], Callable[[NDArray[np.bool_]], Array]]:
+    """Names of the meshes of a data set's database, and what scores them all by a mask's most alike silhouette."""
+    entries = json.loads((folder / DATABASE_FILE).read_text())
+    views = np.stack([described(folder, entry["file"], count) for entry in entries])
+    spread = views.reshape(-1, views.shape[-1]).std(axis=0)
+    names = [entry["name"] for entry in entries]
+    return names, lambda mask: -np.linalg.norm((views - moments(mask)) / spread, axis=-1).min(axis=1)
 
 
 def described(folder: Path, file: str, count: int) -> Array:

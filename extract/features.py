@@ -4,6 +4,9 @@ The grid is like a vision transformer's, so that everything above works with eit
 directions of the silhouette's edge (the shape), a fainter one of edges inside (handles before the body, rims, spouts),
 the share of the object in it, and how deep inside it lies. Directions count modulo 180 degrees, in the spirit of
 HOG (Dalal and Triggs, 2005): colours of a stored mesh and of a real object seldom agree, their outlines do.
+
+The summary of a crop is both histograms on a coarser grid, seen along axes that hardly change when something hides a
+part of the object or light falls otherwise (`summary_axes.npz`, which bench/summary_axes.py makes).
 """
 
 from __future__ import annotations
@@ -25,10 +28,11 @@ from .protocols import Floats, PatchFeatures, PatchGrid
 
 BINS = 6
 CLASSICAL_CROP_PX, CLASSICAL_GRID = 120, 30
-# Weights of what a cell holds. Measured by bench/retrieval.py.
+# Weights of what a cell holds, and of the edges inside in the summary. Measured by bench/retrieval.py.
 OUTLINE, INSIDE, SHARE, DEPTH = 1.0, 0.5, 0.25, 0.25
-INSIDE_SUMMARY = 0.15
+INSIDE_SUMMARY = 0.6
 SUMMARY_CELLS = 8
+SUMMARY_AXES = Path(__file__).with_name("summary_axes.npz")
 DEPTH_PX = 10.0
 BLUR_PX = 1.2
 
@@ -37,7 +41,7 @@ BLUR_PX = 1.2
 class ClassicalFeatures:
     """`PatchFeatures` of plain image processing; numbers are small, so it runs at 120 px."""
 
-    name: str = "classical-1"
+    name: str = "classical-2"
     crop_px: int = CLASSICAL_CROP_PX
     grid: int = CLASSICAL_GRID
 
@@ -47,19 +51,22 @@ class ClassicalFeatures:
 
     @property
     def summary_size(self) -> int:
-        return 2 * BINS * SUMMARY_CELLS**2
+        return int(_summary_axes()[1].shape[1])
 
     def encode(self, crops: NDArray[np.uint8], masks: NDArray[np.bool_]) -> PatchGrid:
         """Features of crops (B, S, S, 3) and their masks (B, S, S)."""
         patches = np.empty((len(crops), self.grid, self.grid, self.patch_size), np.float32)
-        summary = np.empty((len(crops), self.summary_size), np.float32)
+        coarse = np.empty((len(crops), 2 * BINS * SUMMARY_CELLS**2), np.float32)
         for k, (rgb, mask) in enumerate(zip(crops, masks, strict=True)):
-            patches[k] = _cells(rgb, mask, self.grid)
-            summary[k] = _pooled(patches[k], SUMMARY_CELLS)
-        return PatchGrid(patches, summary)
+            patches[k] = crop_cells(rgb, mask, self.grid)
+            coarse[k] = pooled(patches[k])
+        mean, axes = _summary_axes()
+        # Of nothing the summary is zero, not what the mean lacks.
+        off = np.where(coarse.any(axis=1, keepdims=True), coarse - mean, np.float32(0))
+        return PatchGrid(patches, unit(off @ axes))
 
 
-def _cells(rgb: NDArray[np.uint8], mask: NDArray[np.bool_], grid: int) -> Floats:
+def crop_cells(rgb: NDArray[np.uint8], mask: NDArray[np.bool_], grid: int) -> Floats:
     """(G, G, 2 BINS + 2) features of one crop."""
     inside = mask.astype(np.float32)
     soft = cv2.GaussianBlur(inside, (0, 0), BLUR_PX)
@@ -88,14 +95,22 @@ def _gradient(values: NDArray[Any]) -> tuple[Floats, Floats]:
     return np.asarray(cv2.Sobel(values, -1, 1, 0), np.float32), np.asarray(cv2.Sobel(values, -1, 0, 1), np.float32)
 
 
-def _pooled(cells: Floats, count: int) -> Floats:
-    """Both histograms on a coarser grid, each of unit length, the inner one weighted."""
-    weights = _pooling(cells.shape[0], count)
-    pooled = np.einsum("ui,vj,ijb->uvb", weights, weights, cells[..., : 2 * BINS], optimize=True)
-    outline, inner = pooled[..., :BINS].ravel(), pooled[..., BINS:].ravel()
-    outline = outline / max(float(np.linalg.norm(outline)), 1e-9)
-    inner = INSIDE_SUMMARY * inner / max(float(np.linalg.norm(inner)), 1e-9)
-    return np.concatenate([outline, inner], dtype=np.float32)
+def pooled(cells: Floats) -> Floats:
+    """(P,) both histograms of cells (G, G, D) on SUMMARY_CELLS x SUMMARY_CELLS, of unit length.
+
+    Of square roots (Hellinger's kernel), so that long straight edges do not outvote a handle's short ones.
+    """
+    weights = _pooling(cells.shape[0], SUMMARY_CELLS)
+    coarse = np.sqrt(np.einsum("ui,vj,ijb->uvb", weights, weights, cells[..., : 2 * BINS], optimize=True))
+    outline, inside = unit(coarse[..., :BINS].ravel()), unit(coarse[..., BINS:].ravel())
+    return unit(np.concatenate([outline, INSIDE_SUMMARY * inside]))
+
+
+@functools.cache
+def _summary_axes() -> tuple[Floats, Floats]:
+    """Mean (P,) and axes (P, E) of the summary."""
+    with np.load(SUMMARY_AXES) as stored:
+        return np.asarray(stored["mean"], np.float32), np.asarray(stored["axes"], np.float32)
 
 
 @functools.lru_cache(maxsize=4)

@@ -152,22 +152,27 @@ def onboard(
     store = MeshStore.create(root, settings, make_features(encoder, dict(options)))
     jobs = [Job(source, Path(root).absolute(), settings, encoder, unit_name, options) for source in sources]
     result = Onboarded()
+    done: list[tuple[str, str, str]] = []
     with store.only_writer():
-        seen: set[str] = set()
         ends = on_cluster(onboard_one, jobs, workers, gpus) if ray else in_processes(onboard_one, jobs, workers)
-        for done, (job, end) in enumerate(ends, start=1):
+        for count, (job, end) in enumerate(ends, start=1):
             state, found = end or ("failed", "the process at work on it died; it may need more memory than there is")
-            name = job.source.name
             if state == "failed":
-                result.failed.append((name, found))
-            elif found in seen or state == "same":
-                result.same.append(name)
+                result.failed.append((job.source.name, found))
             else:
-                (result.stored if state == "stored" else result.before).append(name)
-            seen.add(found)
+                done.append((job.source.name, state, found))
             if progress is not None:
-                progress(done, len(jobs), name)
+                progress(count, len(jobs), job.source.name)
         store.index()
+    owners: dict[str, int] = {}  # of equal meshes the one that was stored, whichever ended first
+    for place in sorted(range(len(done)), key=lambda k: done[k][1] == "same"):
+        owners.setdefault(done[place][2], place)
+    for place, (name, state, key) in enumerate(done):
+        if owners[key] != place:
+            result.same.append(name)
+        else:
+            # Views without a note of their source are of a command that was killed between the two.
+            (result.stored if state == "stored" else result.before).append(name)
     return result
 
 

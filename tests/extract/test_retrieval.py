@@ -74,6 +74,18 @@ def test_summary_is_of_shape_not_of_colour() -> None:
     assert summary[0] @ summary[2] < 0.3
 
 
+def test_what_hides_a_part_changes_the_summary_less_than_another_shape_does() -> None:
+    rows, columns = np.mgrid[:120, :120]
+    disc = np.hypot(rows - 60, columns - 50) < 44
+    ring = np.abs(np.hypot(rows - 60, columns - 98) - 14) < 4  # a handle
+    whole, hidden = disc | ring, (disc | ring) & (rows + columns < 150)
+    masks = np.stack([whole, hidden, disc, (disc | ring) & (rows > 0)])
+    crops = np.where(masks[..., None], np.uint8(150), np.uint8(0)) * np.ones(3, np.uint8)
+    mug, covered, ball, same = FEATURES.encode(crops, masks).summary
+    assert mug @ same > 0.99
+    assert mug @ ball < mug @ covered
+
+
 def test_average_over_object_cells_is_that_of_a_loop() -> None:
     rng = np.random.default_rng(1)
     patches, masks = rng.normal(size=(3, 30, 30, 5)).astype(np.float32), rng.random((3, 120, 120)) > 0.97
