@@ -9,7 +9,8 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..envs.jet import filling_m3, jet_of
+from ..envs.grip import center_of_mass_m
+from ..envs.jet import filling_kg, filling_m3, jet_of
 from ..envs.kinematics import HAND_BODY
 from ..envs.panda import panda_spec
 from ..extract.geometry import Array
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
     from ..envs.reference import Reference
 
 HELD_BODY = "held_vessel"
-WATER_KG_M3 = 1000.0
 
 
 @dataclass(frozen=True)
@@ -39,8 +39,8 @@ def payload_of(reference: Reference, contents_kg: float = 0.0) -> Payload:
     if vessel is None:
         return Payload(max(contents_kg, 1e-3), np.zeros(3), np.full(3, 1e-6))
     mass_kg = float(vessel.mass_kg) + contents_kg
-    center_m = np.asarray(vessel.mesh.center_mass) * float(vessel.mass_kg) / mass_kg
     a, b, c = (float(e) for e in vessel.extents_m)
+    center_m = center_of_mass_m(vessel, contents_kg)
     return Payload(mass_kg, center_m, mass_kg / 8.0 * np.array([b * b + c * c, a * a + c * c, a * a + b * b]))
 
 
@@ -51,10 +51,9 @@ def contents_of(reference: Reference) -> tuple[float, Array]:
     """
     if not reference.header.get("vessel") or not reference.has_receptacle:
         return 0.0, np.zeros(len(reference))
-    vessel = reference.vessel()
-    filled_m3 = filling_m3(vessel, reference.receptacle())
-    jet = jet_of(reference.T_world_object, vessel, filled_m3, reference.control_hz)
-    return WATER_KG_M3 * filled_m3, 1.0 - min(jet.poured, 1.0) * np.cumsum(jet.share)
+    vessel, receptacle = reference.vessel(), reference.receptacle()
+    jet = jet_of(reference.T_world_object, vessel, filling_m3(vessel, receptacle), reference.control_hz)
+    return filling_kg(vessel, receptacle), 1.0 - min(jet.poured, 1.0) * np.cumsum(jet.share)
 
 
 def arm_with(payload: Payload, T_hand_object: Array) -> Any:

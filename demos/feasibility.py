@@ -63,7 +63,7 @@ def _findings(reference: Reference, joints: JointTrajectory) -> tuple[dict[str, 
     nearest = {name: max((e for e in found if e.quantity == name), key=lambda e: e.part) for name in LIMITS}
     grasp = reference.header.get("grasp", {})
     payload = payload_of(reference, float(joints.header.get("contents_kg", 0.0)))
-    grip = grip_of(joints, reference.T_hand_object, payload)
+    grip = grip_of(joints, reference.T_hand_object, payload, float(grasp.get("width_m", 0.0)))
     findings: dict[str, Any] = {
         "position_error_m": _summary(position_m, joints.time_s),
         "rotation_error_rad": _summary(rotation_rad, joints.time_s),

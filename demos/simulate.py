@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..envs.kinematics import panda_chain
+from ..envs.observations import ENVIRONMENT_NAMES
 from ..envs.reference import Reference
 from ..extract.errors import UserError
-from ..extract.geometry import Array, angle_between_rad
+from ..extract.geometry import Array
 from ..extract.stages import Progress
 from ..extract.video import VideoWriter, iterate_frames
 from .attempt import FIXED_ENV_KWARGS
@@ -25,6 +25,8 @@ PANEL_HEIGHT_PX = 480
 STRIP_HEIGHT_PX = 40
 # Told by environments in which friction holds the vessel: how far it has moved and turned in the hand.
 _SLIP = ("slip_m", "slip_rad")
+# Of the vessel itself, which under friction may have turned in the hand.
+_TILT = ENVIRONMENT_NAMES.index("object_tilt_rad")
 _BACKGROUND, _EMPTY = (24, 26, 30), (60, 64, 72)
 _TEXT, _POURED, _SPILLED = (236, 238, 242), (74, 163, 255), (255, 107, 87)
 
@@ -102,8 +104,7 @@ class _Recorder:
         self, step: int, action: NDArray[np.float32], observation: Observation, reward: float, info: Info
     ) -> None:
         q_rad = np.asarray(observation["agent_pos"][:7], float)
-        T_world_object = panda_chain().hand(q_rad)[0] @ self._reference.T_hand_object
-        tilt_rad = float(angle_between_rad(T_world_object[:3, 2], np.array([0.0, 0.0, 1.0])))
+        tilt_rad = float(observation["environment_state"][_TILT])
         knot = min(step, len(self._reference) - 1)
         values = {
             "time_s": step / self._fps,

@@ -12,8 +12,9 @@ from scipy.spatial.transform import Rotation
 from ..extract.errors import UserError
 from ..extract.geometry import Array, invert_pose, make_pose
 from .collision import CollisionChecker
-from .grasps import MAX_WIDTH_M, grasp_candidates, wide_grasps
-from .jet import filling_m3, jet_of
+from .grasps import MAX_WIDTH_M, held_grasps, wide_grasps
+from .grip import HOLDS, weight_part
+from .jet import filling_kg, filling_m3, jet_of
 from .kinematics import arm_seeds, limit_margin_rad, solve_ik
 from .placement_search import Placement, Stage, search_placement
 from .receptacle import mouth_radius_m
@@ -108,7 +109,7 @@ def pour_reference(
     movable = start_xy_m is None and receptacle_xy_m is None and heading_deg is None
     notes = ["built-in motion, not from a video"]
     try:
-        T_hand_object, q_start_rad = reachable_grasp(vessel, T)
+        T_hand_object, q_start_rad = reachable_grasp(vessel, T, filling_kg(vessel, receptacle))
         clear = not movable or _is_clear(vessel, T_hand_object, receptacle, T_receptacle, T, q_start_rad)
     except UserError:
         if not movable:
@@ -245,28 +246,36 @@ def _rise_over_rim_m(vessel: Vessel, receptacle: Vessel, R: Array, above_rim_m: 
     return np.asarray(base + scale * left)
 
 
-def reachable_grasp(vessel: Vessel, T_world_object: Array) -> tuple[Array, Array]:
+def reachable_grasp(vessel: Vessel, T_world_object: Array, contents_kg: float) -> tuple[Array, Array]:
     """The grasp (4, 4) and start posture (7,) that carry the vessel along the path with the widest joint margins.
 
-    The middles of the vessel's grasp regions come first; only where none serves is every way to hold it tried.
-    Raises UserError when nothing does.
+    What friction could hold comes first, then what it nearly could; among these the middles of the vessel's grasp
+    regions before every other way. Raises UserError when nothing serves.
     """
-    regions = [region for region in vessel.grasps if region.width_m <= MAX_WIDTH_M]
     plain = [
-        grasp_pose(region, pitch_rad, upside)
-        for region in regions
+        (grasp_pose(region, pitch_rad, upside), region.width_m)
+        for region in vessel.grasps
+        if region.width_m <= MAX_WIDTH_M
         for pitch_rad in (0.0, 0.5)
         for upside in (False, True)
     ]
-    if plain and (found := _carrying(plain, T_world_object)) is not None:
-        return found
-    others = [grasp.T_hand_object for grasp in grasp_candidates(vessel) if grasp.fits_hand]
-    if not others:
+    grasps = held_grasps(vessel, contents_kg, T_world_object)
+    others = [(grasp.T_hand_object, grasp.width_m) for grasp in grasps if grasp.fits_hand]
+    if not plain + others:
         raise UserError(
             f"no part of the {vessel.category} is narrower than the {100 * MAX_WIDTH_M:.1f} cm that the hand spans"
         )
-    if (found := _carrying(others, T_world_object)) is not None:
-        return found
+
+    def part(way: tuple[Array, float]) -> float:
+        return weight_part(vessel, contents_kg, T_world_object, *way)
+
+    tried = 0.0
+    for most in (HOLDS, 1.4 * HOLDS, 1.9 * HOLDS, np.inf):
+        for ways in (plain, others):
+            chosen = [way[0] for way in ways if tried < part(way) <= most]
+            if chosen and (found := _carrying(chosen, T_world_object)) is not None:
+                return found
+        tried = most
     raise UserError(
         f"the arm cannot carry the {vessel.category} along this pour; move start_xy_m and receptacle_xy_m nearer to "
         "(0.5, 0), tilt less, or turn heading_deg toward 90"

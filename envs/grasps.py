@@ -5,13 +5,14 @@ Hand frame = `panda_hand_tcp`: z is the approach direction, the fingers close al
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..extract.geometry import Array, invert_pose, make_pose, transform_points
+from .grip import HOLDS, weight_part
 from .panda import FINGER_MAX_M, PAD_M
 from .receptacle import surface_points
 
@@ -20,6 +21,10 @@ if TYPE_CHECKING:
 
 # What the fingers span at most, less a little room on both sides.
 MAX_WIDTH_M = 2 * FINGER_MAX_M - 0.002
+# From which part of the grip on a weight makes a grasp less liked, and by how much.
+_EASY, _HOLD_COST = 0.8, 2.0
+# From where handles are approached: about where they point to, and across, with a finger between handle and body.
+_USUAL_DEG, _ACROSS_DEG = (0.0, -25.0, 25.0), (-75.0, -50.0, 50.0, 75.0)
 # The tips reach so far below a rim whose wall they hold.
 RIM_GRASP_M = 0.022
 # Boxes of the hand in its own frame, m: (low, high). The pads end 1 cm beyond the tcp; the palm begins 45 mm behind.
@@ -49,13 +54,36 @@ class Grasp:
 
 
 def grasp_candidates(vessel: Vessel) -> list[Grasp]:
-    """Grasps of all regions of a vessel: slid along the region, turned about it, pitched, with either palm side up.
+    """Usual grasps of a vessel's regions: slid along the region, turned about it, pitched, with either palm side up.
 
     Grasps whose palm or fingers would cut into the vessel are left out. What is wider than the fingers open is held by
     the wall at its rim; regions that are too wide are used only when it has no rim either.
     """
     regions = [region for region in vessel.grasps if region.width_m <= MAX_WIDTH_M]
     return _clear(regions or rim_regions(vessel) or list(vessel.grasps), vessel)
+
+
+def held_grasps(vessel: Vessel, contents_kg: float, T_object: Array) -> list[Grasp]:
+    """Grasps for carrying a filled vessel through attitudes (N, 4, 4), z up, each liked less the harder it is to hold.
+
+    What friction can hold in no usual way, a heavy kettle by its handle, may be held across as well: fingers that close
+    along the lever of the weight are not turned by it.
+    """
+
+    def weighed(grasps: list[Grasp]) -> list[tuple[float, Grasp]]:
+        parts = [weight_part(vessel, contents_kg, T_object, g.T_hand_object, g.width_m) for g in grasps]
+        return [
+            (part, replace(g, cost=g.cost + _HOLD_COST * max(part - _EASY, 0.0)))
+            for part, g in zip(parts, grasps, strict=True)
+        ]
+
+    found = weighed(grasp_candidates(vessel))
+    if min(part for part, _ in found) > HOLDS:
+        handles = [r for r in vessel.grasps if r.kind == "handle" and r.width_m <= MAX_WIDTH_M]
+        points = surface_points(vessel)
+        across = [grasp for region in handles for grasp in _of_region(region, vessel, _ACROSS_DEG)]
+        found += weighed([grasp for grasp in across if not _cuts(grasp, points)])
+    return [grasp for _, grasp in found]
 
 
 def wide_grasps(vessel: Vessel) -> list[Grasp]:
@@ -102,7 +130,7 @@ def rim_regions(vessel: Vessel) -> list[GraspRegion]:
     return regions
 
 
-def _of_region(region: GraspRegion, vessel: Vessel) -> list[Grasp]:
+def _of_region(region: GraspRegion, vessel: Vessel, turns_deg: tuple[float, ...] = _USUAL_DEG) -> list[Grasp]:
     axis = region.axis / np.linalg.norm(region.axis)
     approach = region.approach - (region.approach @ axis) * axis
     approach /= np.linalg.norm(approach)
@@ -112,7 +140,7 @@ def _of_region(region: GraspRegion, vessel: Vessel) -> list[Grasp]:
         region.kind == "handle" and lying
     )
     # A round body and a lying handle can be approached from anywhere, other handles from about where they point to.
-    turns_rad = np.arange(12) * np.pi / 6 if around else np.deg2rad([0.0, -25.0, 25.0])
+    turns_rad = np.arange(12) * np.pi / 6 if around else np.deg2rad(turns_deg)
     if region.kind == "body" and not around:
         turns_rad = np.array([0.0, np.pi])
     grasps = []

@@ -2,7 +2,7 @@
 
 Under friction the vessel is a free body. What the pads press on is the convex hull of its surface between them, which
 is exact for flat pads, and seen by nothing else. A rack couples the fingers as in the Franka Hand, and they press with
-the force that it can keep up.
+what it can keep up, harder only where the weight asks for it.
 """
 
 from __future__ import annotations
@@ -17,17 +17,15 @@ from scipy.spatial.transform import Rotation
 
 from ..extract.errors import UserError
 from ..extract.geometry import Array, invert_pose, make_pose, transform_points
+from .grip import RUBBER
 from .kinematics import HAND_BODY, JOINT_COUNT
-from .panda import CONTACT_GRIP, CONTACT_ROBOT, FINGER_JOINTS, FINGER_MAX_M, FINGER_MAX_N, FINGER_N_M, PAD_M, PADS
+from .panda import CONTACT_GRIP, CONTACT_ROBOT, FINGER_JOINTS, FINGER_MAX_M, FINGER_N_M, PAD_M, PADS
 from .vessel_geometry import gripper_half_width_m
 
 if TYPE_CHECKING:
     from ..extract.vessels import Vessel
 
 Grasp = Literal["weld", "friction"]
-# Sliding friction of rubber, and its resistance to turning on the spot in m: two thirds of the radius of a patch as
-# wide as a pad. Rolling is resisted by the several points at which pads touch.
-RUBBER = [1.0, 0.006, 0.0]
 # How far beyond the pads the vessel's true shape is kept, so that one that slips a little is still held by it.
 MARGIN_M, HULL_VERTICES = 0.003, 64
 CLOSING_S = 0.15
@@ -44,9 +42,17 @@ def set_grasp_options(option: mujoco.MjOption) -> None:
 
 
 def add_grip(
-    spec: mujoco.MjSpec, body: mujoco.MjsBody, vessel: Vessel, T_hand_object: Array, timestep_s: float
+    spec: mujoco.MjSpec,
+    body: mujoco.MjsBody,
+    vessel: Vessel,
+    T_hand_object: Array,
+    timestep_s: float,
+    pressing_n: float,
 ) -> None:
-    """Make a free body of the spec holdable: rubber on the pads, the hull between them, the rack of the fingers."""
+    """Make a free body of the spec holdable: rubber on the pads, the hull between them, the rack of the fingers.
+
+    pressing_n: what each finger presses with.
+    """
     stiff = [2 * timestep_s, 1.0]
     for name in PADS:
         pad = spec.geom(name)
@@ -56,6 +62,8 @@ def add_grip(
     mesh.maxhullvert = HULL_VERTICES
     geom = body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, name=mesh.name, meshname=mesh.name)
     geom.contype, geom.conaffinity, geom.group, geom.mass = CONTACT_GRIP, 0, 3, 0.0
+    for name in FINGER_JOINTS:
+        spec.actuator(name).forcerange = (-pressing_n, pressing_n)
     rack = spec.add_equality(type=mujoco.mjtEq.mjEQ_JOINT, name1=FINGER_JOINTS[0], name2=FINGER_JOINTS[1])
     rack.data[:5], rack.solref[:2] = (0.0, 1.0, 0.0, 0.0, 0.0), stiff
 
@@ -98,7 +106,8 @@ class Holding:
         self.free = int(model.body_dofnum[self._vessel]) == 6
         self.positions, self.velocities = (7, 6) if self.free else (0, 0)
         width_m = gripper_half_width_m(vessel, T_hand_object)
-        self._command_m = width_m - FINGER_MAX_N / FINGER_N_M if self.free else width_m
+        pressing_n = float(model.actuator(FINGER_JOINTS[0]).forcerange[1])
+        self._command_m = width_m - pressing_n / FINGER_N_M if self.free else width_m
         # The closed hand: the vessel's pose in it and where the fingers are.
         self._T_closed, self._fingers_m = np.array(T_hand_object, np.float64), np.array([width_m, width_m])
 

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from ..extract.vessels import Vessel
 
 GRAVITY_M_S2 = 9.81
+WATER_KG_M3 = 1000.0
 # Out of a spout by its channel's friction; over a lip as slowly as a shallow stream, faster once the wall slopes down.
 SPOUT_SPEED_M_S, LIP_SPEED_M_S = 0.65, 0.25
 _SLIDE_PART = 0.85
@@ -58,6 +59,11 @@ def tilt_rad(T: Array) -> Array:
 def filling_m3(vessel: Vessel, receptacle: Vessel) -> float:
     """What the simulator's grains take up by default: a quarter of the vessel, or half of the receptacle."""
     return min(0.25 * vessel.interior_volume_m3, 0.5 * receptacle.interior_volume_m3)
+
+
+def filling_kg(vessel: Vessel, receptacle: Vessel | None) -> float:
+    """The same as mass of water; nothing without a receptacle."""
+    return 0.0 if receptacle is None else WATER_KG_M3 * filling_m3(vessel, receptacle)
 
 
 def jet_of(T: Array, vessel: Vessel, filled_m3: float, control_hz: float) -> Jet:

@@ -42,8 +42,9 @@ DTAU_MAX_NM_S = 1000.0
 PAYLOAD_MAX_KG = 3.0
 Q_HOME_RAD: Array = np.array([0.0, -0.785398, 0.0, -2.35619, 0.0, 1.5707, 0.785398])
 FINGER_MAX_M = 0.04
-# What the Franka Hand can press with for as long as one likes, and the stiffness of its servos here.
-FINGER_MAX_N, FINGER_N_M = 70.0, 1000.0
+# What the Franka Hand can press with for as long as one likes, and at most (datasheet: continuous force 70 N, maximum
+# force 140 N); the stiffness of its servos here.
+FINGER_MAX_N, FINGER_PEAK_N, FINGER_N_M = 70.0, 140.0, 1000.0
 
 # Stiffness and damping of the joint servos. Natural frequencies lie near 9 Hz at the shoulder and 14 Hz at the wrist
 # with damping ratio about 1: fast enough to follow 25 Hz targets, slow enough that a step between two targets

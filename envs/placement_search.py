@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from ..extract.geometry import Array, rotation_angle_rad
 from .collision import Collision, CollisionChecker
-from .grasps import Grasp, grasp_candidates
-from .jet import tilt_rad
+from .grasps import Grasp, held_grasps
+from .jet import filling_kg, tilt_rad
 from .kinematics import arm_seeds, limit_margin_rad, manipulability, panda_chain, solve_ik
 from .panda import DQ_MAX_RAD_S, Q_HOME_RAD, Q_MAX_RAD, Q_MIN_RAD
 
@@ -102,9 +102,10 @@ def search_placement(
     """The best place, yaw and grasp for a motion, or how far the nearest one misses.
 
     thorough: False stops at the first ranking (is it possible at all?), without refinement and collision checks.
-    grasps: to choose among; `grasp_candidates` of the vessel if None.
+    grasps: to choose among; `held_grasps` of the vessel if None.
     """
-    grasps = grasp_candidates(stage.vessel) if grasps is None else grasps
+    if grasps is None:
+        grasps = held_grasps(stage.vessel, filling_kg(stage.vessel, stage.receptacle), stage.T_object)
     knots = _spread_knots(stage.T_object)
     T_object = stage.T_object[knots]
     pour = int(np.argmin(np.abs(knots - int(np.argmax(tilt_rad(stage.T_object))))))

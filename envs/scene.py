@@ -19,11 +19,22 @@ from scipy.spatial.transform import Rotation
 from ..extract.errors import UserError
 from ..extract.geometry import Array, invert_pose, make_pose, transform_points
 from .cameras import CameraPose, add_cameras
+from .grip import pressing_n, weight_part
 from .holding import Grasp, add_grip, set_grasp_options
+from .jet import filling_kg
 from .kinematics import HAND_BODY
 from .liquid import Liquid, add_particles
 from .panda import CONTACT_HELD, CONTACT_PARTICLE, CONTACT_ROBOT, CONTACT_VESSEL, panda_spec
-from .vessel_geometry import STANDING_WALL_M, Box, Cavity, cavity_of, collision_boxes, convex_hull, visual_parts
+from .vessel_geometry import (
+    STANDING_WALL_M,
+    Box,
+    Cavity,
+    cavity_of,
+    collision_boxes,
+    convex_hull,
+    gripper_half_width_m,
+    visual_parts,
+)
 
 if TYPE_CHECKING:
     from ..extract.vessels import Vessel
@@ -110,7 +121,7 @@ def build_scene(
     else:
         held = spec.worldbody.add_body(name=VESSEL_BODY, **_placed(reference.T_world_object[0]))
         held.add_freejoint()
-        add_grip(spec, held, vessel, reference.T_hand_object, timestep_s)
+        add_grip(spec, held, vessel, reference.T_hand_object, timestep_s, _pressing_n(reference, vessel, receptacle))
         set_grasp_options(spec.option)
     _add_vessel(spec, held, vessel, vessel_boxes, vessel_contact)
     _add_hull(spec, held, vessel, contact)
@@ -136,6 +147,12 @@ def build_scene(
         radius_m,
         liquid,
     )
+
+
+def _pressing_n(reference: Reference, vessel: Vessel, receptacle: Vessel | None) -> float:
+    """What each finger presses with on the vessel, filled as usual, along the reference."""
+    T, width_m = reference.T_hand_object, 2.0 * gripper_half_width_m(vessel, reference.T_hand_object)
+    return pressing_n(weight_part(vessel, filling_kg(vessel, receptacle), reference.T_world_object, T, width_m))
 
 
 def particle_obstacles(model: mujoco.MjModel, body: str) -> list[Box]:

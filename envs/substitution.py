@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..extract.geometry import Array
+from .jet import filling_kg
 from .reference import Reference, vessel_to_header
 
 if TYPE_CHECKING:
@@ -35,7 +36,8 @@ def with_vessel(reference: Reference, vessel: Vessel) -> Reference:
     R_pour = reference.T_world_object[reference.pour_index, :3, :3]
     shift_m = R_pour @ (np.asarray(old.outlet.point_m, float) - np.asarray(vessel.outlet.point_m, float))
     moved = _moved(reference, lift_m, shift_m)
-    T_hand_object, q_start_rad = reachable_grasp(vessel, moved.T_world_object)
+    contents_kg = filling_kg(vessel, reference.receptacle() if reference.has_receptacle else None)
+    T_hand_object, q_start_rad = reachable_grasp(vessel, moved.T_world_object, contents_kg)
     return moved.with_header(
         vessel=vessel_to_header(vessel),
         symmetry=vessel.symmetry.to_json(),

@@ -9,9 +9,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from vid2demo.demos.joints import JointTrajectory
 from vid2demo.demos.retarget import retarget
-from vid2demo.demos.simulate import PANEL_HEIGHT_PX, STRIP_HEIGHT_PX, _on_clock, simulate
+from vid2demo.demos.rollout import DEFAULT_ENV_ID, make_env
+from vid2demo.demos.simulate import PANEL_HEIGHT_PX, STRIP_HEIGHT_PX, _on_clock, _Recorder, simulate
 from vid2demo.envs.reference import Reference
 from vid2demo.extract.errors import UserError
 from vid2demo.extract.video import VideoWriter, iterate_frames, read_video_info
@@ -103,6 +105,30 @@ def test_without_a_video_the_robot_stands_alone_and_friction_tells_of_slip(
     assert 0.0 < held["slip_rad"] < np.deg2rad(3)
     assert held["position_error_m"]["max"] < 0.005
     assert "slip_m" not in result
+
+
+def test_the_tilt_told_is_the_vessels_own_when_it_has_turned_in_the_hand(
+    files: tuple[Path, Path], tmp_path: Path
+) -> None:
+    reference = Reference.load(files[0])
+    env = make_env(DEFAULT_ENV_ID, reference, num_particles=0, grasp="friction", obs_mode="both", image_size=(48, 64))
+    env.reset(seed=0)
+    simulation = env.unwrapped.simulation
+    before_rad = float(np.arccos(simulation.vessel_R[2, 2]))
+    turned = Rotation.from_rotvec([0.0, 0.4, 0.0]) * Rotation.from_matrix(simulation.vessel_R)
+    env.unwrapped.data.qpos[12:16] = turned.as_quat(scalar_first=True)
+    simulation.refresh()
+    recorder = _Recorder(reference, 25, "front", None)
+    with VideoWriter(tmp_path / "one.mp4", fps=25) as writer:
+        recorder.open(writer, None)
+        info = env.step(env.action_space.sample())[4]
+        simulation.refresh()
+        env.unwrapped.data.qpos[12:16] = turned.as_quat(scalar_first=True)
+        simulation.refresh()
+        recorder(0, np.zeros(7, np.float32), env.unwrapped._observation(), 0.0, info)
+    env.close()
+    assert before_rad < 0.05
+    assert recorder.series()["tilt_rad"] == [pytest.approx(0.4, abs=0.05)]
 
 
 def test_files_of_two_motions_are_refused(files: tuple[Path, Path], tmp_path: Path) -> None:

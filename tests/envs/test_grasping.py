@@ -3,10 +3,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from vid2demo.envs.collision import CollisionChecker
-from vid2demo.envs.grasps import MAX_WIDTH_M, grasp_candidates
+from vid2demo.envs.grasps import MAX_WIDTH_M, Grasp, grasp_candidates, held_grasps
+from vid2demo.envs.grip import HOLDS, pressing_n, weight_part
 from vid2demo.envs.jet import filling_m3, jet_of
 from vid2demo.envs.kinematics import panda_chain
-from vid2demo.envs.panda import DDQ_MAX_RAD_S2, Q_HOME_RAD
+from vid2demo.envs.panda import DDQ_MAX_RAD_S2, FINGER_MAX_N, FINGER_PEAK_N, Q_HOME_RAD
 from vid2demo.envs.receptacle import surface_points
 from vid2demo.envs.reference import Reference, minimum_jerk
 from vid2demo.envs.retiming import slowed
@@ -49,6 +50,41 @@ def test_the_fingers_close_across_a_handle() -> None:
         if grasp.kind == "handle":
             # The handle lies in the vessel's xz plane: the closing direction is never along it.
             assert abs(grasp.T_object_hand[1, 1]) > 0.85
+
+
+def test_a_heavy_kettle_may_be_held_across_its_handle_with_a_finger_inside() -> None:
+    T, kettle = tilting(80.0, category="electric_kettle")
+    usual, held = grasp_candidates(kettle), held_grasps(kettle, 0.2, T)
+
+    def part(grasp: Grasp) -> float:
+        return weight_part(kettle, 0.2, T, grasp.T_hand_object, grasp.width_m)
+
+    assert len(held) > len(usual)
+    assert min(map(part, usual)) > HOLDS
+    assert min(map(part, held)) < 0.9 * min(map(part, usual))
+    # What is added closes rather along the handle's distance from the body, and cuts into nothing.
+    added = held[len(usual) :]
+    assert all(abs(grasp.T_object_hand[0, 1]) > 0.6 for grasp in added)
+    points = surface_points(kettle)
+    for grasp in added[::5]:
+        local = transform_points(grasp.T_hand_object, points)
+        assert np.all(np.abs(local - [0.0, 0.0, -0.09]) < [0.03, 0.10, 0.04], axis=1).sum() <= 2
+    # The harder to hold, the less liked.
+    plain = {tuple(grasp.T_object_hand.ravel()): grasp.cost for grasp in usual}
+    dearer = [grasp.cost - plain[tuple(grasp.T_object_hand.ravel())] for grasp in held[: len(usual)]]
+    order = np.argsort([part(grasp) for grasp in held[: len(usual)]])
+    assert np.all(np.diff(np.array(dearer)[order]) >= -1e-12)
+
+
+def test_what_is_light_is_held_as_ever() -> None:
+    T, mug = tilting(110.0)
+    assert [(g.cost, g.kind) for g in held_grasps(mug, 0.1, T)] == [(g.cost, g.kind) for g in grasp_candidates(mug)]
+
+
+def test_the_fingers_press_harder_only_where_the_weight_asks_for_it() -> None:
+    assert pressing_n(0.0) == pressing_n(HOLDS) == FINGER_MAX_N
+    assert pressing_n(1.5 * HOLDS) == pytest.approx(1.5 * FINGER_MAX_N)
+    assert pressing_n(9.0) == FINGER_PEAK_N
 
 
 def tilting(
