@@ -1,7 +1,11 @@
-"""Which stored mesh a video shows (FreePose, appendix A.1): the object is masked all the way, thirty frames vote."""
+"""Which stored mesh a video shows, and how large that is (FreePose, section 3.1 and appendices A.1 and A.3).
+
+The object is masked all the way; thirty frames vote for the mesh, and the median over them is the size.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import chain, tee
 from pathlib import Path
@@ -10,22 +14,38 @@ import cv2
 import numpy as np
 
 from .errors import UserError
+from .geometry import Array, focal_prior_camera_matrix
 from .masks import read_mask
 from .neural_segment import FOR_VIDEOS, large_enough
-from .protocols import Box, Image, Mask, PatchFeatures, Segmenter
+from .protocols import Box, DepthEstimator, Image, Mask, PatchFeatures, Segmenter
 from .retrieval import FRAMES, Hit, Retriever, look_at_object, spread_frames
-from .segment import check_box
+from .scale import SizeReader, scene_sizes
+from .segment import check_box, mask_box
 from .video import iterate_frames, read_video_info
 
 WORK_SIDE_PX = 640
+OTHER_OVERLAP = 0.5  # of the smaller one: a proposal that shares more with the object is the object, or a part of it
+
+
+@dataclass(frozen=True)
+class SizeMeans:
+    """What reads sizes off pictures: the usual ones by words, and how objects of a frame compare by depth."""
+
+    words: SizeReader
+    depth: DepthEstimator
 
 
 @dataclass(frozen=True)
 class Found:
-    """The meshes most like an object, best first, and the frames that voted: those of the chosen in which it shows."""
+    """The meshes most like an object, best first.
+
+    frames: that voted: those of the chosen in which it shows.  size_m: largest full extent; None where nothing reads
+    it.
+    """
 
     hits: tuple[Hit, ...]
     frames: tuple[int, ...]
+    size_m: float | None = None
 
 
 def find_in_video(
@@ -39,10 +59,11 @@ def find_in_video(
     text: str | None = None,
     frames: int = FRAMES,
     top: int = 5,
+    sizes: SizeMeans | None = None,
 ) -> Found:
     """Search for the object that a box or a mask shows in the first frame, in pixels of the video.
 
-    frames: at most so many, spread over the video, vote.
+    frames: at most so many, spread over the video, vote.  sizes: without these the size is left open.
     Raises UserError when neither or both of box and mask are given, or nothing shows there.
     """
     if (box_xywh_px is None) == (mask_file is None):
@@ -71,4 +92,27 @@ def find_in_video(
     if not shown:
         raise UserError(f"nothing that could be told apart shows in {video} there; give a --mask instead")
     look = look_at_object(features, retriever.store.settings.extend, shown)
-    return Found(tuple(retriever.retrieve(look, top=top, text=text)), tuple(voted))
+    hits = tuple(retriever.retrieve(look, top=top, text=text))
+    return Found(hits, tuple(voted), None if sizes is None else size_over_frames(shown, segmenter, sizes))
+
+
+def size_over_frames(shown: Sequence[tuple[Image, Mask]], segmenter: Segmenter, means: SizeMeans) -> float:
+    """Largest full extent [m] of the object of frames and masks: the median of what each frame says by itself.
+
+    In every frame the object is compared with whatever else is found there; alone it has the size of the table.
+    """
+    height, width = shown[0][1].shape
+    camera_matrix: Array = focal_prior_camera_matrix(width, height)
+    found = []
+    for rgb, mask in shown:
+        proposed = [p.mask for p in segmenter.propose(rgb, "objects.") if large_enough(p.mask, FOR_VIDEOS)]
+        masks = [mask, *(other for other in proposed if _overlap(other, mask) < OTHER_OVERLAP)]
+        guesses = means.words.guess(rgb, masks, [mask_box(one) for one in masks])
+        depth = means.depth.estimate(rgb, camera_matrix)
+        found.append(scene_sizes(depth, masks, camera_matrix, [guess.size_m for guess in guesses]).sizes_m[0])
+    return float(np.median(found))
+
+
+def _overlap(one: Mask, other: Mask) -> float:
+    """What two masks share, of the smaller one."""
+    return float(np.count_nonzero(one & other) / min(np.count_nonzero(one), np.count_nonzero(other)))

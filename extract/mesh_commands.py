@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional, UseAppendAction, arg
 
@@ -160,6 +160,8 @@ class MeshesShow(Command):
 class MeshesFind(Command):
     """Find the meshes most like an object that a video shows: it is masked all the way, and its frames vote.
 
+    Where networks for depth and words are at hand they read its size too, frame by frame; the median counts.
+
     For example: vid2demo meshes find coffee.mp4 --box 345 297 488 342 --db runs/meshes
     """
 
@@ -177,39 +179,48 @@ class MeshesFind(Command):
     models_dir: ModelsDir = None
 
     def do(self) -> Result:
-        from .choose import choose
+        from .choose import Chosen, choose
         from .classical_segment import ClassicalSegmenter
         from .features import features_of
-        from .find_mesh import find_in_video
-        from .protocols import Segmenter
+        from .find_mesh import SizeMeans, find_in_video
+        from .model_folder import models_folder
         from .retrieval import Retriever
-
-        def classical() -> Segmenter:
-            return ClassicalSegmenter()
+        from .scale import SizeReader
 
         with Terminal() as terminal:
             store = _opened(self.db, self.encoder, self.views) if self.db else _library(terminal)
-        chosen = choose("segmenter", classical, level=self.level, models_dir=self.models_dir)
+        kind: dict[str, Any] = {"level": self.level, "models_dir": self.models_dir}
+        segmenter = choose("segmenter", ClassicalSegmenter, **kind)
+        depth: Chosen[Any] = choose("depth", lambda: None, **kind)
+        words: Chosen[Any] = choose("words", lambda: None, **kind)
+        sizes = None
+        if depth.made is not None and words.made is not None:
+            sizes = SizeMeans(SizeReader(words.made, cache=models_folder(self.models_dir)), depth.made)
         options = {"models_dir": str(self.models_dir)} if self.models_dir else {}
         found = find_in_video(
             self.video,
             Retriever(store),
             features_of(store.encoder, options),
-            chosen.made,
+            segmenter.made,
             box_xywh_px=self.box,
             mask_file=self.mask,
             text=self.object,
             frames=self.frames,
+            sizes=sizes,
         )
         meshes = [
             {"name": hit.about.name, "category": hit.about.category, "score": round(hit.score, 4), "key": hit.key}
             for hit in found.hits
         ]
-        return {"segmenter": chosen.line(), "frames": list(found.frames), "meshes": meshes}
+        told = {"segmenter": segmenter.line(), "frames": list(found.frames), "meshes": meshes, "size_m": found.size_m}
+        return told | {"size": f"{depth.line()}, {words.line()}"}
 
     def words(self, result: Result) -> str:
         rows = [f"{m['score']:.3f}  {m['name']:<28} {m['category']}" for m in result["meshes"]]
-        return "\n".join([result["segmenter"], f"{len(result['frames'])} frames voted", *rows])
+        voted = f"{len(result['frames'])} frames voted"
+        if result["size_m"] is not None:
+            voted += f"; largest extent {result['size_m']:.3f} m ({result['size']})"
+        return "\n".join([result["segmenter"], voted, *rows])
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -71,11 +71,6 @@ def scene_sizes(
     return SceneSizes(np.maximum(sizes, LEAST_SIZE_M), ratio, measured)
 
 
-def sizes_over_frames(frames: Sequence[SceneSizes]) -> Array:
-    """(K,) median over the frames of a video, each of whose objects are the same K; at least one frame."""
-    return np.asarray(np.median([frame.sizes_m for frame in frames], axis=0))
-
-
 def measured_size(depth: Floats, mask: Mask, camera_matrix: Array, rim_px: int = RIM_PX) -> float:
     """Largest side, in the depth's unit, of the box along the principal axes of an object's points; NaN if too few."""
     points = object_points(depth, mask, camera_matrix, rim_px)

@@ -11,7 +11,6 @@ from vid2demo.extract.geometry import focal_prior_camera_matrix, invert_pose, lo
 from vid2demo.extract.neural_words import NeuralWords
 from vid2demo.extract.raster import render_depth
 from vid2demo.extract.scale import (
-    SceneSizes,
     SizeReader,
     largest_part,
     measured_size,
@@ -19,7 +18,6 @@ from vid2demo.extract.scale import (
     object_points,
     principal_extents,
     scene_sizes,
-    sizes_over_frames,
     without_rim,
 )
 from vid2demo.extract.size_table import SizeEntry, SizeTable, own_table, prompt
@@ -202,11 +200,6 @@ def test_extents_do_not_depend_on_the_pose() -> None:
     box = rng.uniform(-1, 1, (4000, 3)) * [0.5, 0.3, 0.1]
     for R in Rotation.random(5, rng=rng).as_matrix():
         np.testing.assert_allclose(principal_extents(box @ R.T + [3.0, 2.0, 9.0]), [1.0, 0.6, 0.2], rtol=0.06)
-
-
-def test_video_takes_the_median_over_its_frames() -> None:
-    frames = [SceneSizes(np.array([0.1 * k, 0.3]), 1.0, np.zeros(2)) for k in (1, 2, 9)]
-    np.testing.assert_allclose(sizes_over_frames(frames), [0.2, 0.3])
 
 
 def test_model_reads_the_median_size_of_the_11_likeliest_phrases(tiny_models: Path) -> None:
