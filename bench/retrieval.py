@@ -1,6 +1,6 @@
 """How often the right category is retrieved, by which descriptor, and what a search costs.
 
-    OMP_NUM_THREADS=1 MUJOCO_GL=egl python bench/retrieval.py DATASET [--db DB] [--json]
+    OMP_NUM_THREADS=1 MUJOCO_GL=egl python bench/retrieval.py DATASET [--db DB] [--views 600] [--json]
     OMP_NUM_THREADS=1 python bench/retrieval.py --cost [--objects 50000] [--json]
     OMP_NUM_THREADS=1 python bench/retrieval.py --onboarding [--objects 24] [--views 600] [--json]
 
@@ -50,12 +50,12 @@ def rank(scores: NDArray[Any], categories: list[str], wanted: str) -> int:
     return order.index(wanted) if wanted in order else len(order)
 
 
-def accuracy(dataset_folder: Path, db: Path | None) -> dict[str, Any]:
+def accuracy(dataset_folder: Path, db: Path | None, views: int) -> dict[str, Any]:
     """Shares of objects whose category comes first, and among the first five, by method."""
     root = db or dataset_folder / "views"
     if db is None:
-        onboard(find_sources(dataset_folder), root)
-    store = MeshStore.open(root)
+        onboard(find_sources(dataset_folder), root, settings=ViewSettings(count=views))
+    store = MeshStore.open(root, "classical", views)
     features = features_of(store.encoder)
     dataset = open_dataset(dataset_folder)
     named = json.loads((dataset_folder / "categories.json").read_text("utf-8"))
@@ -242,7 +242,7 @@ def main() -> None:
     else:
         if chosen.dataset is None:
             SynthesizeBop(out=DATASET).do()
-        found = accuracy(chosen.dataset or DATASET, chosen.db)
+        found = accuracy(chosen.dataset or DATASET, chosen.db, chosen.views)
     print(json.dumps(found, indent=2) if chosen.json else as_text(found))
 
 
