@@ -158,8 +158,12 @@ def _phases(reference: Reference, position_m: Array, rotation_rad: Array) -> lis
 def _changed(reference: Reference) -> dict[str, Any]:
     """What the robot does otherwise than the video shows, in numbers; `changes` tells the same in words."""
     video_s = float(reference.video_time_s[-1] - reference.video_time_s[0])
+    # Of the pour that `--scale auto` chose; another scale stands in the reference already.
+    chosen: dict[str, float] = next((t for t in reference.header.get("scale_search", []) if t["chosen"]), {})
     return {
         "scale": reference.scale,
+        "receptacle_moved_m": float(np.hypot(chosen.get("along_m", 0.0), chosen.get("across_m", 0.0))),
+        "tipped_further_rad": float(np.deg2rad(chosen.get("tip_deg", 0.0))),
         "time_stretch": float(reference.header.get("time_stretch", 1.0)),
         "video_s": video_s,
         "robot_s": reference.duration_s,

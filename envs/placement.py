@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..extract.errors import UserError
-from ..extract.geometry import Array, angle_between_rad, invert_pose, make_pose
+from ..extract.geometry import Array, angle_between_rad, invert_pose, make_pose, rotation_angle_rad
 from ..extract.track import ObjectTrack
 from .grasps import MAX_WIDTH_M
 from .jet import filling_m3, jet_of, tilt_rad
@@ -120,7 +120,11 @@ def build_reference(
         "scale_chosen": "auto" if scale == "auto" else "given",
         "time_stretch": 1.0,
         "T_world_camera": T_world_camera.tolist(),
-        "changed": {"leaps": [asdict(leap) for leap in resampled.leaps]},
+        "changed": {
+            "leaps": [asdict(leap) for leap in resampled.leaps],
+            # By how much gravity, where something upright told it, differs from the assumed elevation's.
+            "camera_turned_rad": float(rotation_angle_rad(camera_rotation(elevation_deg), seen.R_up_camera)),
+        },
         "settings": {
             "control_hz": control_hz,
             "elevation_deg": elevation_deg,

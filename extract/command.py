@@ -33,7 +33,11 @@ Episodes = Annotated[int, arg(metavar="N", help="Successful demonstrations to co
 MeshUnit = Annotated[Literal["auto", "m", "cm", "mm", "in"], arg(help="Unit of length of --mesh.")]
 Scale = Annotated[
     Literal["auto"] | float,
-    arg(metavar="auto|FLOAT", help="Robot's motion over the video's [ratio]; auto takes what the arm can reach."),
+    arg(
+        metavar="auto|FLOAT",
+        help="Size of the robot's path over the video's [ratio]; auto keeps the video's where it pours well in the "
+        "simulator, and else takes the size, receptacle place and tilt that pour best. 1.0: faithful.",
+    ),
 ]
 Category = Annotated[str, arg(metavar="NAME", help="What is poured from: a word or category of `meshes list`.")]
 Receiver = Annotated[str, arg(metavar="NAME", help="What is poured into: a word or category of `meshes list`.")]

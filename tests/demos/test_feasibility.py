@@ -197,7 +197,14 @@ def test_too_heavy_and_too_wide_are_told_with_both_numbers(easy: tuple[Reference
 
 
 def test_what_was_changed_is_told_in_numbers(easy: tuple[Reference, JointTrajectory]) -> None:
-    changed = feasibility(*easy)["changed"]
+    reference, joints = easy
+    changed = feasibility(reference, joints)["changed"]
     assert changed["scale"] == 0.9
+    assert changed["receptacle_moved_m"] == changed["tipped_further_rad"] == 0.0
+    tried = {"along_m": 0.03, "across_m": -0.04, "tip_deg": 20.0, "chosen": True}
+    searched = reference.with_header(scale_search=[{**tried, "chosen": False, "tip_deg": 0.0}, tried])
+    found = feasibility(searched, joints)["changed"]
+    assert found["receptacle_moved_m"] == pytest.approx(0.05)
+    assert found["tipped_further_rad"] == pytest.approx(np.deg2rad(20.0))
     assert changed["time_stretch"] == 1.25
     assert changed["robot_s"] == pytest.approx(2.0)
