@@ -19,6 +19,7 @@ from .video import Image
 
 SAMPLES = 24
 BLUR_PX = 1.0
+RIM = 5  # px, of the square by which what is covered shrinks
 SAME_LEVELS = 12.0  # grey levels, of a channel, by which what is the same may differ: noise, compression
 SHADOW_LEVELS = 9.0  # by which a shadow may differ from the background made darker
 DARKEST = 0.4  # brightness of a shadow, of the background's
@@ -55,19 +56,27 @@ class Background:
         return Background(np.ascontiguousarray(self.rgb[window]), np.ascontiguousarray(self.known[window]))
 
     def covered(self, rgb: Image) -> NDArray[np.bool_]:
-        """(H, W) where something stands before a background that is known there."""
-        return np.asarray(self.known & (self.labels(rgb) == FOREGROUND))
+        """(H, W) where something stands before a background that is known there, surely: not along its rim.
+
+        There colours mix and labels, which are those of a blurred picture, reach too far.
+        """
+        covered = self.known & (self.labels(rgb) == FOREGROUND)
+        return np.asarray(cv2.erode(covered.astype(np.uint8), np.ones((RIM, RIM), np.uint8)) > 0)
 
 
 def mask_trust(mask: NDArray[np.bool_], labels: NDArray[np.uint8]) -> NDArray[np.float32]:
     """(H, W) in [0, 1] how far a mask of an object is to be believed, by the `labels` of the background.
 
     Hardly where something else stands before the background, a hand: it may hide the object. Half where it may have
-    taken in a shadow, for grey things pass for shadows.
+    taken in a shadow, for grey things pass for shadows; hardly where that shadow goes on outside of it.
     """
+    shadow = labels == SHADOW
+    count, part = cv2.connectedComponents(shadow.astype(np.uint8))
+    goes_on = np.bincount(part[~mask], minlength=count) > np.bincount(part[mask], minlength=count)
     trust = np.ones(mask.shape, np.float32)
     trust[~mask & (labels == FOREGROUND)] = HIDDEN_TRUST
-    trust[mask & (labels == SHADOW)] = SHADOW_TRUST
+    trust[mask & shadow] = SHADOW_TRUST
+    trust[mask & shadow & goes_on[part]] = HIDDEN_TRUST
     return trust
 
 

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .geometry import Array
+from .geometry import Array, scaled_camera
 from .segment import Box, Mask
 from .video import Image
 
@@ -182,7 +182,7 @@ class CameraWatch:
         H, inlier = fit
         if H is None:
             return lost
-        K = np.diag([self._scale, self._scale, 1.0]) @ self.camera_matrix
+        K = scaled_camera(self.camera_matrix, self._scale)
         R, share = _rotation(key.start.astype(float), key.now.astype(float), K, inlier[:, 0] > 0)
         quality = float(np.mean(inlier))
         if share >= TURN_SHARE * quality:

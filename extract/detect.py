@@ -14,11 +14,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from .colours import mask_evidence
 from .first_pose import edge_score, silhouette_ious, upright_rotation
-from .geometry import Array, make_pose
+from .geometry import Array, make_pose, scaled_camera
 from .handled import Handled, find_handled, reach_from_border
 from .raster import render_depth
-from .region import TrackingMesh, edge_strength, extract_outline, mask_evidence, refine
+from .region import TrackingMesh, edge_strength, extract_outline, refine
 from .segment import Box, Mask, mask_box, mask_from_box
 from .video import Image
 
@@ -100,7 +101,7 @@ def find_object(
     """
     scale = SEARCH_WIDTH_PX / max(rgb.shape[:2])
     small = cv2.resize(rgb, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    small_camera = np.diag([scale, scale, 1.0]) @ camera_matrix
+    small_camera = scaled_camera(camera_matrix, scale)
     edges = _edge_maps(np.asarray(small, np.uint8))
     size = (small.shape[1], small.shape[0])
     small_moved = np.asarray(cv2.resize(moved.astype(np.float32), size, interpolation=cv2.INTER_AREA), np.float32)

@@ -16,9 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from .colours import mask_evidence
 from .geometry import Array, Symmetry, make_pose, super_fibonacci_rotations, transform_points
 from .raster import render_depth
-from .region import Outline, TrackingMesh, edge_strength, extract_outline, mask_evidence, refine
+from .region import Outline, TrackingMesh, edge_strength, extract_outline, refine
 from .segment import Box, Mask, mask_box
 from .video import Image
 

@@ -22,9 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from .colours import ColourModel, colour_bins
 from .follow import Followed
 from .geometry import Array, make_pose, project, transform_points
-from .region import ColourModel, Lines, TrackingMesh, colour_bins, edge_strength, measure, refine
+from .region import Lines, TrackingMesh, edge_strength, measure, refine
 from .video import Frame, VideoInfo, sample_frames
 
 FRAMES = 20  # looked at

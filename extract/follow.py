@@ -17,12 +17,13 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from .background import Background
+from .colours import ColourModel, colour_bins
 from .depth_size import scaled_vessel, size_of_clip
 from .depth_video import DepthView
 from .first_pose import edge_score
 from .geometry import Array, Symmetry, invert_pose
 from .raster import render_depth
-from .region import ColourModel, TrackingMesh, colour_bins, edge_strength
+from .region import TrackingMesh, edge_strength
 from .segment import Mask
 from .shape_fit import View, fit_shape, tracking_mesh
 from .spin import HIDDEN_EVIDENCE, SURELY_OURS, best_turns, object_evidence, turn_scores, turned
@@ -32,6 +33,7 @@ from .video import Image
 
 GLIMPSES = 30  # frames kept for the spin
 FIT_VIEWS = 6  # frames that the shape is fitted to
+FIT_STEPS_PX = (3.0, 1.5, 1.0, 1.0, 1.0, 1.0)
 WHOLE_EVERY = max(1, GLIMPSES // (2 * FIT_VIEWS))
 SECOND_LOOK_RAD = np.deg2rad(60)  # most that a second look at the spin may change: it mends, it does not turn round
 SURE = 0.5  # least confidence of a frame that the shape may be fitted to
@@ -176,7 +178,7 @@ class Followed:
             for g in chosen
             if g.bins is not None and g.colours is not None
         ]
-        fitted, fitted_poses = fit_shape(vessel, views, self.camera_matrix)
+        fitted, fitted_poses = fit_shape(vessel, views, self.camera_matrix, FIT_STEPS_PX)
         before = self._merit(tracking_mesh(vessel), [v.T_camera_object for v in views], chosen)
         after = self._merit(tracking_mesh(fitted), fitted_poses, chosen)
         if after <= before:

@@ -105,6 +105,15 @@ def project(camera_matrix: Array, points_camera_m: Array) -> Array:
     return uvw[..., :2] / uvw[..., 2:]
 
 
+def scaled_camera(camera_matrix: Array, scale: float) -> Array:
+    """(3, 3) intrinsics in px of the same picture made `scale` times as large by averaging or interpolation.
+
+    Centres of pixels lie at integers (OpenCV), so that a picture begins half a pixel before 0 at any size.
+    """
+    shift = (scale - 1) / 2
+    return np.asarray(np.array([[scale, 0.0, shift], [0.0, scale, shift], [0.0, 0.0, 1.0]]) @ camera_matrix)
+
+
 def projected_box(
     camera_matrix: Array, T_camera_object: Array, points_m: Array
 ) -> tuple[float, float, float, float] | None:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from .errors import UserError
 from .files import atomic_path
-from .geometry import Array
+from .geometry import Array, scaled_camera
 from .raster import render_depth
 from .region import TrackingMesh
 from .segment import Mask
@@ -57,7 +57,7 @@ def write_masks(path: Path, track: ObjectTrack, mesh: TrackingMesh) -> None:
     width, height = track.header["image_size_px"]
     scale = min(1.0, MASK_SIDE_PX / max(width, height))
     size = (round(width * scale), round(height * scale))
-    camera = np.diag([scale, scale, 1.0]) @ track.camera_matrix
+    camera = scaled_camera(track.camera_matrix, scale)
     runs = [
         _runs(_silhouette(mesh, T, camera, size) if visible else np.zeros((size[1], size[0]), bool))
         for T, visible in zip(track.T_camera_object, track.visible, strict=True)

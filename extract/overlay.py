@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from .geometry import Array, project, transform_points
+from .geometry import Array, project, scaled_camera, transform_points
 from .raster import render_depth
 from .region import TrackingMesh
 from .track import ObjectTrack
@@ -43,7 +43,7 @@ def write_overlay(video: Path, items: Sequence[OverlayItem], out: Path, max_side
 def draw_track(image: Image, item: OverlayItem, index: int, scale: float, colour: tuple[int, int, int]) -> None:
     """Draw one track at frame `index` onto an image that is `scale` times the track's image size, in place."""
     track, T = item.track, item.track.T_camera_object[index]
-    K = np.diag([scale, scale, 1.0]) @ track.camera_matrix
+    K = scaled_camera(track.camera_matrix, scale)
     height, width = image.shape[:2]
     visible = bool(track.visible[index])
     window = render_depth(item.mesh.vertices_m, item.mesh.faces, T, K)

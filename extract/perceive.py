@@ -26,7 +26,7 @@ from .errors import UserError
 from .files import atomic_path
 from .focal import focal_of_clip, scaled_focal
 from .follow import Followed
-from .geometry import Array, focal_prior_camera_matrix, projected_box
+from .geometry import Array, focal_prior_camera_matrix, projected_box, scaled_camera
 from .masks import read_mask, write_masks
 from .overlay import OverlayItem, write_overlay
 from .progress import Progress
@@ -62,7 +62,7 @@ class _Scene:
     depth: DepthVideo | None = None
 
     def camera(self, scale: float) -> Array:
-        return np.asarray(np.diag([scale, scale, 1.0]) @ self.camera_matrix)
+        return scaled_camera(self.camera_matrix, scale)
 
 
 @dataclass(frozen=True)

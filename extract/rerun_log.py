@@ -6,10 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from .errors import UserError
 from .files import atomic_path
+from .geometry import scaled_camera
 from .overlay import OverlayItem
 from .video import iterate_frames
 
@@ -45,7 +44,7 @@ def write_rerun(video: Path, items: Sequence[OverlayItem], out: Path) -> None:
             recording.set_time("video", duration=frame.time_s)
             height, width = frame.rgb.shape[:2]
             scale = width / track.header["image_size_px"][0]
-            camera = np.diag([scale, scale, 1.0]) @ track.camera_matrix
+            camera = scaled_camera(track.camera_matrix, scale)
             if frame.index == 0:
                 recording.log("camera/image", rr.Pinhole(image_from_camera=camera, width=width, height=height))
             recording.log("camera/image", rr.Image(frame.rgb).compress(jpeg_quality=80))

@@ -15,14 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from .colours import ColourModel
 from .geometry import Array, project, transform_points
 from .raster import render_depth
-from .region import ColourModel, Lines, TrackingMesh, measure
+from .region import Lines, TrackingMesh, measure
 from .segment import Box
 from .vessels import Vessel, make_vessel, outline_mesh, parameter_space
 
 FIXED = ("wall_m", "red", "green", "blue")  # not seen in a silhouette
 PRIOR_SHARE = 0.15  # standard deviation of a shape parameter around its start, as a share of its range
+PRIOR_TURN_RAD, PRIOR_SHIFT = 0.1, 0.03  # standard deviation of a pose around its start; of the distance
 TRACKING_FACES = 8000
 BOX_STD_PX = 4.0  # how exactly people draw boxes
 
@@ -110,8 +112,10 @@ def fit_shape(
             rows[:, 6 * len(used) :] = J_shape
             normal += rows.T @ (weight[:, None] * rows)
             gradient += rows.T @ (weight * offset_px)
-            pose_prior = np.diag([1 / 0.2**2] * 3 + [1 / (0.05 * T[2, 3]) ** 2] * 3)
-            normal[6 * slot : 6 * slot + 6, 6 * slot : 6 * slot + 6] += pose_prior
+            pose_prior = np.array([1 / PRIOR_TURN_RAD**2] * 3 + [1 / (PRIOR_SHIFT * T[2, 3]) ** 2] * 3)
+            own = slice(6 * slot, 6 * slot + 6)
+            normal[own, own] += np.diag(pose_prior)
+            gradient[own] -= pose_prior * _twist(views[k].T_camera_object, T)
         tail = slice(6 * len(used), size)
         normal[tail, tail] += np.diag(1 / prior_std**2)
         gradient[tail] -= (values - start) / prior_std**2
@@ -135,6 +139,12 @@ def _surface(category: str, params: dict[str, float]) -> Surface:
 
 def _with(vessel: Vessel, changes: dict[str, float]) -> Vessel:
     return make_vessel(vessel.category, None, **{**vessel.params, **{k: float(v) for k, v in changes.items()}})
+
+
+def _twist(T_from: Array, T: Array) -> Array:
+    """(6,) what `_moved` would have to be given to come from one pose to another, turn first."""
+    turn = Rotation.from_matrix(T[:3, :3] @ T_from[:3, :3].T).as_rotvec()
+    return np.concatenate([turn, T[:3, 3] - T_from[:3, 3]])
 
 
 def _moved(T: Array, delta: Array) -> Array:

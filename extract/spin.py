@@ -17,9 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
+from .colours import ColourModel
 from .geometry import Array
 from .raster import render_depth
-from .region import ColourModel, TrackingMesh
+from .region import TrackingMesh
 
 SPINS = 36
 EVIDENCE_RANGE = (-1.0, 2.0)  # log-odds; skin over a handle must not outvote the frames that show the handle

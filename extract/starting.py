@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 
 from .background import mask_trust
 from .candidates import Model, ObjectRequest, vessel_model
+from .colours import mask_evidence
 from .errors import UserError
 from .first_pose import PoseCandidate, distinct, find_first_pose, judge
-from .geometry import Array
+from .geometry import Array, scaled_camera
 from .raster import render_depth
-from .region import TrackingMesh, edge_strength, mask_evidence
+from .region import TrackingMesh, edge_strength
 from .segment import Box, Mask, mask_box, mask_from_box, mask_from_silhouette
 from .shape_fit import View, coloured, fit_shape
 from .video import Image
@@ -119,7 +120,7 @@ def start_object(
     # Coarse first: at full sharpness highlights and texture tear the mask apart.
     shrink = min(1.0, WORKING_SIDE_PX / max(rgb.shape[:2]))
     small = np.asarray(cv2.resize(rgb, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA), np.uint8)
-    small_box, small_camera = scaled(box, shrink), np.diag([shrink, shrink, 1.0]) @ camera_matrix
+    small_box, small_camera = scaled(box, shrink), scaled_camera(camera_matrix, shrink)
     cut = mask_from_box(small, small_box) if mask is None else resized(mask, small)
     ranked: list[tuple[PoseCandidate, Model]] = []
     for model in candidates:

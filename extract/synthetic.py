@@ -1,7 +1,7 @@
 """Synthetic videos of a person pouring, with the exact pose of every object: the demo's clip and the tests' oracle.
 
-Pixel convention of the written camera matrix: the image spans [0, width] x [0, height], so the centre of the first
-pixel is (0.5, 0.5) and the principal point of the renderer is exactly (width / 2, height / 2).
+The camera matrix is OpenCV's: the centre of the first pixel is (0, 0), and the renderer's principal point, in the
+middle of the picture, ((width - 1) / 2, (height - 1) / 2).
 """
 
 from __future__ import annotations
@@ -161,7 +161,7 @@ def synthesize(
     common = {
         "image_size_px": list(size),
         "video": {"file": video.name, "sha256": info.sha256, "frames": count},
-        "camera": {"source": "given", "pixel_convention": "centre of the first pixel is (0.5, 0.5)"},
+        "camera": {"source": "given", "pixel_convention": "centre of the first pixel is (0, 0)"},
         "settings": {"made_by": "synthesize", "seed": seed, "exact": True},
     }
     T_receptacle = np.tile(path.T_world_receptacle, (count, 1, 1))

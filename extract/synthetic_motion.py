@@ -138,7 +138,7 @@ def place_camera(
     elevation, azimuth = np.deg2rad(rng.uniform(15, 35)), np.deg2rad(rng.uniform(-25, 25))
     fovy = np.deg2rad(rng.uniform(30, 46))
     focal = height / 2 / np.tan(fovy / 2)
-    camera_matrix = np.array([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
+    camera_matrix = np.array([[focal, 0.0, (width - 1) / 2], [0.0, focal, (height - 1) / 2], [0.0, 0.0, 1.0]])
     backward = np.array([np.sin(azimuth) * np.cos(elevation), -np.cos(azimuth) * np.cos(elevation), np.sin(elevation)])
 
     few = shape.points_m[:: max(1, len(shape.points_m) // 400)]
@@ -157,7 +157,7 @@ def place_camera(
                 break
             pixels = project(camera_matrix, inside)
             low, high = pixels.min(axis=0), pixels.max(axis=0)
-            off = (low + high) / 2 - [width / 2, height / 2]
+            off = (low + high) / 2 - camera_matrix[:2, 2]
             target = target + (T[:3, 0] * off[0] + T[:3, 1] * off[1]) * distance / focal
         else:
             share = _height_share(camera_matrix, T, standing, height)

@@ -16,22 +16,13 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from .background import Background
+from .colours import HIDDEN_BIN, ColourModel, colour_bins
 from .depth_term import Surface, draw_surface, settle
 from .depth_video import DepthView
 from .first_pose import share_on_edges
-from .geometry import Array, Symmetry, make_pose, project, transform_points
+from .geometry import Array, Symmetry, make_pose, project, scaled_camera, transform_points
 from .raster import render_depth
-from .region import (
-    HIDDEN_BIN,
-    ColourModel,
-    Outline,
-    TrackingMesh,
-    colour_bins,
-    draw_outline,
-    edge_strength,
-    measure,
-    refine,
-)
+from .region import Outline, TrackingMesh, draw_outline, edge_strength, measure, refine
 from .segment import Mask
 from .spin import object_evidence
 from .texture import NO_MATCHES, Matches, Texture, flattened
@@ -157,7 +148,7 @@ class ObjectTracker:
             self.colours.start_hiding(bins[near & ~mask & background.covered(rgb)])
         inside = None if self._outline is None else self._outline.inside((mask.shape[0], mask.shape[1]))
         if inside is not None:
-            self.colours.update(inside, bins, 1.0)
+            inside.teach(self.colours, bins, 1.0)
         part = self._around(rgb, T_camera_object)
         self.texture.keep(part.picture, part.camera_matrix, T_camera_object)
 
@@ -207,7 +198,7 @@ class ObjectTracker:
         self.textured_frames += self._tells_spin(fit.matches)
         self.texture.judge(fit.matches, fit.strain)
         if fit.confidence >= LEARN_ABOVE and fit.outline is not None:
-            self.colours.update(fit.outline, part.bins, LEARNING_RATE)
+            fit.outline.teach(self.colours, part.bins, LEARNING_RATE)
             if fit.confidence >= KEY_ABOVE:
                 self.texture.keep(part.picture, part.camera_matrix, T)
 
@@ -298,7 +289,7 @@ class ObjectTracker:
         """Poses whose silhouettes cover the object's colours best: rotations of key views, where the colours are."""
         evidence = object_evidence(part.bins, self.colours)
         small = cv2.resize(evidence, None, fx=SEARCH_SCALE, fy=SEARCH_SCALE, interpolation=cv2.INTER_AREA)
-        camera = np.diag([SEARCH_SCALE, SEARCH_SCALE, 1.0]) @ part.camera_matrix
+        camera = scaled_camera(part.camera_matrix, SEARCH_SCALE)
         depth_m = float(self._pose[2, 3])
         reach = max(3, int(self.mesh.radius_m * camera[0, 0] / depth_m))
         heat = cv2.blur(small, (reach, reach), borderType=cv2.BORDER_CONSTANT)

@@ -25,7 +25,7 @@ from .classical_segment import ClassicalSegmenter
 from .coarse_pose import PoseGuess, coarse_poses, fine_poses
 from .errors import UserError
 from .features import ClassicalFeatures
-from .geometry import Array, make_pose, rotation_angle_rad
+from .geometry import Array, make_pose, rotation_angle_rad, scaled_camera
 from .masks import read_mask
 from .mesh_sources import LIBRARY, MeshSource
 from .mesh_store import MeshStore
@@ -194,7 +194,7 @@ def pose_through_video(
     count = info.frame_count
     progress(0, count, f"drawing the views of {request.name}")
     subjects, store = subjects_of(request, means, templates or templates_folder())
-    K = np.asarray(np.diag([_scale(info), _scale(info), 1.0]) @ camera_matrix)
+    K = scaled_camera(camera_matrix, _scale(info))
     clip = _Clip(info, start)
 
     views: dict[int, dict[str, list[PoseGuess]]] = {}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from vid2demo.extract.background import BACKGROUND, FOREGROUND, SHADOW, learn_background
+from vid2demo.extract.background import BACKGROUND, FOREGROUND, SHADOW, learn_background, mask_trust
 from vid2demo.extract.handled import find_handled, reach_from_border
 
 HEIGHT, WIDTH, COUNT = 120, 160, 24
@@ -60,6 +60,33 @@ def test_labels_tell_thing_shadow_and_background() -> None:
     assert np.mean(labels[cup] == FOREGROUND) > 0.95
     assert np.mean(labels[86:91, 30:50] == SHADOW) > 0.8
     assert np.mean(labels[100:, 60:] == BACKGROUND) > 0.97
+
+
+def test_what_is_covered_for_sure_ends_where_the_thing_does() -> None:
+    """Labels are those of a blurred picture and reach beyond a thing: outlines would be led outward by them."""
+    frames, _, cup = clip(np.random.default_rng(3))
+    background = learn_background(frames)
+    assert background is not None
+    beside = np.zeros_like(cup)
+    beside[58:80, 51:60] = True  # where there is neither shadow nor arm
+    assert np.any((background.labels(frames[0]) == FOREGROUND) & beside)
+    covered = background.covered(frames[0])
+    assert not np.any(covered & beside)
+    assert np.mean(covered[cup]) > 0.85
+
+
+def test_a_mask_is_not_believed_where_a_shadow_in_it_goes_on_outside() -> None:
+    labels = np.full((40, 60), BACKGROUND, np.uint8)
+    mask = np.zeros(labels.shape, bool)
+    mask[10:30, 20:40] = True
+    labels[mask] = FOREGROUND
+    labels[22:30, 5:25] = SHADOW  # of a hand, taken in by the mask
+    labels[12:16, 34:41] = SHADOW  # the thing itself, grey
+    labels[5:10, 40:50] = FOREGROUND  # a hand
+    trust = mask_trust(mask, labels)
+    assert trust[25, 22] < 0.1 < 0.4 < trust[14, 36] < 0.6
+    assert trust[25, 10] == trust[20, 30] == trust[2, 2] == 1
+    assert trust[7, 45] < 0.1
 
 
 def test_a_slow_change_of_light_moves_nothing() -> None:

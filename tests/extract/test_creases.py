@@ -8,18 +8,11 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 from vid2demo.extract.background import BACKGROUND, FOREGROUND, HIDDEN_TRUST, SHADOW, SHADOW_TRUST, mask_trust
+from vid2demo.extract.colours import HIDDEN_BIN, ColourModel, colour_bins
 from vid2demo.extract.creases import crease_pixels
 from vid2demo.extract.geometry import make_pose, project, rotation_angle_rad, transform_points
 from vid2demo.extract.raster import render_depth
-from vid2demo.extract.region import (
-    HIDDEN_BIN,
-    ColourModel,
-    TrackingMesh,
-    colour_bins,
-    draw_outline,
-    edge_strength,
-    refine,
-)
+from vid2demo.extract.region import TrackingMesh, draw_outline, edge_strength, refine
 
 WIDTH, HEIGHT = 320, 240
 K = np.array([[400.0, 0.0, 160.0], [0.0, 400.0, 120.0], [0.0, 0.0, 1.0]])

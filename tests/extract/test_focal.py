@@ -11,11 +11,12 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 from vid2demo.extract.candidates import ObjectRequest
+from vid2demo.extract.colours import ColourModel, colour_bins
 from vid2demo.extract.focal import FocalEstimate, FocalView, estimate_focal, scaled_focal, with_focal
 from vid2demo.extract.geometry import focal_prior_camera_matrix, invert_pose, make_pose, project, transform_points
 from vid2demo.extract.perceive import extract
 from vid2demo.extract.raster import render_depth
-from vid2demo.extract.region import ColourModel, TrackingMesh, colour_bins, extract_outline
+from vid2demo.extract.region import TrackingMesh, extract_outline
 from vid2demo.extract.video import Frame, VideoWriter
 
 WIDTH, HEIGHT = 480, 360
@@ -67,7 +68,7 @@ def told(camera: np.ndarray, wrong: float, seen: list[np.ndarray], seed: int = 0
         if k == 0:
             inside = window.mask_in_image(WIDTH, HEIGHT)
             colours.start_global(bins[inside], bins[~inside])
-        colours.update(outline, bins, 0.3)
+        outline.teach(colours, bins, 0.3)
         start = scaled_focal(camera, wrong)
         view = FocalView.of(Frame(k, 0.06 * k, image), MESH, start, with_focal(T, wrong))
         assert view is not None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -15,6 +16,7 @@ from vid2demo.extract.geometry import (
     make_pose,
     project,
     rotation_angle_rad,
+    scaled_camera,
     super_fibonacci_rotations,
     transform_points,
 )
@@ -84,3 +86,17 @@ def test_super_fibonacci_covers_rotations_evenly() -> None:
     nearest_deg = np.rad2deg(np.arccos(np.clip(cosine, -1, 1)))
     assert nearest_deg.mean() == pytest.approx(14.1, abs=0.7)
     assert nearest_deg.max() < 25
+
+
+@pytest.mark.parametrize("scale", [0.25, 0.5, 2.0])
+def test_a_point_is_seen_where_a_picture_made_smaller_or_larger_shows_it(scale: float) -> None:
+    camera = np.array([[200.0, 0.0, 79.5], [0.0, 200.0, 59.5], [0.0, 0.0, 1.0]])
+    point = np.array([[0.11, -0.07, 0.5]])
+    y, x = np.mgrid[0:120, 0:160]
+    (u, v) = project(camera, point)[0]
+    spot = np.exp(-((x - u) ** 2 + (y - v) ** 2) / (2 * 6.0**2))
+    how = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+    resized = cv2.resize(spot, None, fx=scale, fy=scale, interpolation=how)
+    rows, columns = np.indices(resized.shape)
+    centre = np.array([(columns * resized).sum(), (rows * resized).sum()]) / resized.sum()
+    np.testing.assert_allclose(project(scaled_camera(camera, scale), point)[0], centre, atol=0.03)

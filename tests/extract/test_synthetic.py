@@ -42,8 +42,8 @@ def silhouette(
     """Filled projection of every face, drawn independently of MuJoCo; a pixel counts when its centre is covered."""
     fine = 4
     pixels = project(camera_matrix, transform_points(T_camera_object, np.asarray(vessel.mesh.vertices)))
-    # OpenCV puts integer coordinates on pixel centres; the camera matrix puts them on pixel corners.
-    corners = np.rint((pixels * fine - 0.5) * 16).astype(np.int32)[np.asarray(vessel.mesh.faces)]
+    # A pixel of the picture is `fine` pixels wide here, and centres are at integers in both.
+    corners = np.rint(((pixels + 0.5) * fine - 0.5) * 16).astype(np.int32)[np.asarray(vessel.mesh.faces)]
     image = np.zeros((size[1] * fine, size[0] * fine), np.uint8)
     for triangle in corners:
         cv2.fillConvexPoly(image, triangle, 1, shift=4)
@@ -84,7 +84,7 @@ def test_files_agree_with_each_other(clip: SyntheticClip) -> None:
     assert info.frame_count == len(truth) == len(receptacle) == 10
     np.testing.assert_allclose(truth.time_s, [frame.time_s for frame in iterate_frames(clip.video)], atol=1e-12)
     np.testing.assert_allclose(np.diff(truth.time_s), 0.04, atol=1e-6)
-    np.testing.assert_array_equal(truth.camera_matrix[:2, 2], [80, 60])
+    np.testing.assert_array_equal(truth.camera_matrix[:2, 2], [79.5, 59.5])
     assert truth.camera_matrix[0, 0] == truth.camera_matrix[1, 1]
     assert truth.name == "mug"
     assert receptacle.name == "receptacle"  # two vessels of one category keep different names

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from vid2demo.extract.colours import ColourModel, colour_bins, mask_evidence
 from vid2demo.extract.errors import UserError
 from vid2demo.extract.first_pose import find_first_pose, upright_rotation
 from vid2demo.extract.follow import Followed
@@ -19,7 +20,7 @@ from vid2demo.extract.geometry import (
 )
 from vid2demo.extract.perceive import ObjectRequest, extract
 from vid2demo.extract.raster import render_depth
-from vid2demo.extract.region import ColourModel, colour_bins, extract_outline, mask_evidence, refine
+from vid2demo.extract.region import extract_outline, refine
 from vid2demo.extract.segment import check_box, mask_box, mask_from_box, mask_from_silhouette
 from vid2demo.extract.shape_fit import View, fit_shape, tracking_mesh
 from vid2demo.extract.smoothing import smooth_poses
