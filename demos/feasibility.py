@@ -63,7 +63,8 @@ def _findings(reference: Reference, joints: JointTrajectory) -> tuple[dict[str, 
     nearest = {name: max((e for e in found if e.quantity == name), key=lambda e: e.part) for name in LIMITS}
     grasp = reference.header.get("grasp", {})
     payload = payload_of(reference, float(joints.header.get("contents_kg", 0.0)))
-    grip = grip_of(joints, reference.T_hand_object, payload, float(grasp.get("width_m", 0.0)))
+    width_m = float(grasp.get("width_m", 0.0))
+    grip = grip_of(joints, reference.T_hand_object, payload, width_m, grasp.get("kind") == "body")
     findings: dict[str, Any] = {
         "position_error_m": _summary(position_m, joints.time_s),
         "rotation_error_rad": _summary(rotation_rad, joints.time_s),
@@ -80,7 +81,7 @@ def _findings(reference: Reference, joints: JointTrajectory) -> tuple[dict[str, 
         "time_stretch": float(reference.header.get("time_stretch", 1.0)),
         "solver": joints.header.get("solver", {}).get("name", "mink"),
         "payload_kg": float(joints.header.get("payload_kg", 0.0)),
-        "gripper_width_m": float(grasp.get("width_m", 0.0)),
+        "gripper_width_m": width_m,
         "grip": {**grip.told(), "words": grip.sentence()},
         "caught_part_of_jet": reference.header.get("feasibility", {}).get("caught_part_of_jet"),
         "changed": _changed(reference),

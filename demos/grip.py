@@ -56,10 +56,10 @@ class Grip:
         }
 
 
-def grip_of(joints: JointTrajectory, T_hand_object: Array, payload: Payload, width_m: float) -> Grip:
+def grip_of(joints: JointTrajectory, T_hand_object: Array, payload: Payload, width_m: float, flat: bool) -> Grip:
     """The hardest moment for the fingers of a joint motion with a payload at `T_hand_object` (4, 4).
 
-    width_m: of what is between the fingers.
+    width_m: of what is between the fingers. flat: whether their pads lie on a wall, and not on a handle.
     """
     T_hand = panda_chain().hand(joints.q_rad)
     R = T_hand[:, :3, :3]
@@ -75,7 +75,7 @@ def grip_of(joints: JointTrajectory, T_hand_object: Array, payload: Payload, wid
     moment = np.einsum("nij,nj->ni", inertia, turning) + np.cross(twist[:, 3:], spin) + np.cross(R @ center_m, force)
     # In the hand's frame, whose fingers close along y.
     force, moment = (np.einsum("nji,nj->ni", R, value) for value in (force, moment))
-    part = part_of_grip(force, moment, width_m)
+    part = part_of_grip(force, moment, width_m, flat)
     worst = int(np.argmax(part))
     x, y, z = np.abs(moment[worst])
     along_n = np.hypot(force[worst, 0], force[worst, 2])

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from ..extract.errors import UserError
 from ..extract.geometry import Array, invert_pose, make_pose
 from .collision import CollisionChecker
-from .grasps import MAX_WIDTH_M, held_grasps, wide_grasps
+from .grasps import MAX_WIDTH_M, Grasp, held_grasps, wide_grasps
 from .grip import HOLDS, weight_part
 from .jet import filling_kg, filling_m3, jet_of
 from .kinematics import arm_seeds, limit_margin_rad, solve_ik
@@ -109,8 +109,8 @@ def pour_reference(
     movable = start_xy_m is None and receptacle_xy_m is None and heading_deg is None
     notes = ["built-in motion, not from a video"]
     try:
-        T_hand_object, q_start_rad = reachable_grasp(vessel, T, filling_kg(vessel, receptacle))
-        clear = not movable or _is_clear(vessel, T_hand_object, receptacle, T_receptacle, T, q_start_rad)
+        grasp, q_start_rad = reachable_grasp(vessel, T, filling_kg(vessel, receptacle))
+        clear = not movable or _is_clear(vessel, grasp.T_hand_object, receptacle, T_receptacle, T, q_start_rad)
     except UserError:
         if not movable:
             raise
@@ -118,7 +118,7 @@ def pour_reference(
     if not clear:
         found = _placed(Stage(T, time_s, vessel, receptacle, T_receptacle))
         T, T_receptacle = found.T_world_stage @ T, found.T_world_stage @ T_receptacle
-        T_hand_object, q_start_rad = found.grasp.T_hand_object, found.q_rad[0]
+        grasp, q_start_rad = found.grasp, found.q_rad[0]
         if not found.grasp.fits_hand:
             notes.append(
                 f"The vessel is {100 * found.grasp.width_m:.1f} cm wide where it is held, the fingers open to "
@@ -129,7 +129,8 @@ def pour_reference(
         "symmetry": vessel.symmetry.to_json(),
         "vessel": vessel_to_header(vessel),
         "receptacle": {**vessel_to_header(receptacle), "T_world_receptacle": T_receptacle.tolist()},
-        "T_hand_object": T_hand_object.tolist(),
+        "T_hand_object": grasp.T_hand_object.tolist(),
+        "grasp": grasp.told(),
         "q_start_rad": q_start_rad.tolist(),
         "scale": 1.0,
         "notes": notes,
@@ -246,33 +247,32 @@ def _rise_over_rim_m(vessel: Vessel, receptacle: Vessel, R: Array, above_rim_m: 
     return np.asarray(base + scale * left)
 
 
-def reachable_grasp(vessel: Vessel, T_world_object: Array, contents_kg: float) -> tuple[Array, Array]:
-    """The grasp (4, 4) and start posture (7,) that carry the vessel along the path with the widest joint margins.
+def reachable_grasp(vessel: Vessel, T_world_object: Array, contents_kg: float) -> tuple[Grasp, Array]:
+    """The grasp and start posture (7,) that carry the vessel along the path with the widest joint margins.
 
     What friction could hold comes first, then what it nearly could; among these the middles of the vessel's grasp
     regions before every other way. Raises UserError when nothing serves.
     """
     plain = [
-        (grasp_pose(region, pitch_rad, upside), region.width_m)
+        Grasp(invert_pose(grasp_pose(region, pitch_rad, upside)), region.kind, region.width_m, 0.0)
         for region in vessel.grasps
         if region.width_m <= MAX_WIDTH_M
         for pitch_rad in (0.0, 0.5)
         for upside in (False, True)
     ]
-    grasps = held_grasps(vessel, contents_kg, T_world_object)
-    others = [(grasp.T_hand_object, grasp.width_m) for grasp in grasps if grasp.fits_hand]
+    others = [grasp for grasp in held_grasps(vessel, contents_kg, T_world_object) if grasp.fits_hand]
     if not plain + others:
         raise UserError(
             f"no part of the {vessel.category} is narrower than the {100 * MAX_WIDTH_M:.1f} cm that the hand spans"
         )
 
-    def part(way: tuple[Array, float]) -> float:
-        return weight_part(vessel, contents_kg, T_world_object, *way)
+    def part(g: Grasp) -> float:
+        return weight_part(vessel, contents_kg, T_world_object, g.T_hand_object, g.width_m, g.is_flat)
 
     tried = 0.0
     for most in (HOLDS, 1.4 * HOLDS, 1.9 * HOLDS, np.inf):
         for ways in (plain, others):
-            chosen = [way[0] for way in ways if tried < part(way) <= most]
+            chosen = [grasp for grasp in ways if tried < part(grasp) <= most]
             if chosen and (found := _carrying(chosen, T_world_object)) is not None:
                 return found
         tried = most
@@ -282,16 +282,17 @@ def reachable_grasp(vessel: Vessel, T_world_object: Array, contents_kg: float) -
     )
 
 
-def _carrying(grasps: list[Array], T_world_object: Array) -> tuple[Array, Array] | None:
-    """Of grasps T_hand_object (4, 4), the one that goes all the way most comfortably, and its start posture (7,)."""
-    T_object_hand = np.stack([invert_pose(T) for T in grasps])
+def _carrying(grasps: list[Grasp], T_world_object: Array) -> tuple[Grasp, Array] | None:
+    """The grasp that goes all the way most comfortably, and its start posture (7,)."""
+    T_object_hand = np.stack([grasp.T_object_hand for grasp in grasps])
     seeds = arm_seeds(T_world_object[0] @ T_object_hand)
-    T_object_hand = np.tile(T_object_hand, (len(seeds), 1, 1))
+    of_grasp = np.tile(np.arange(len(grasps)), len(seeds))
+    T_object_hand = T_object_hand[of_grasp]
     q, error = solve_ik(T_world_object[0] @ T_object_hand, seeds.reshape(-1, 7), iterations=60, rest_gain=0.02)
     if len(q) > _FOLLOWED:
         ease = limit_margin_rad(q).min(axis=1) - 100.0 * np.maximum(np.abs(error).max(axis=1) - 2e-3, 0.0)
         kept = np.argsort(-ease)[:_FOLLOWED]
-        q, T_object_hand = q[kept], T_object_hand[kept]
+        q, T_object_hand, of_grasp = q[kept], T_object_hand[kept], of_grasp[kept]
     q_start, worst, margin = q, np.zeros(len(q)), np.full(len(q), np.inf)
     for T in T_world_object[:: max(1, len(T_world_object) // 40)]:
         q_next, error = solve_ik(T @ T_object_hand, q, iterations=8, rest_gain=0.01, damping=0.01)
@@ -300,7 +301,7 @@ def _carrying(grasps: list[Array], T_world_object: Array) -> tuple[Array, Array]
         q = q_next
     margin[worst > 2e-3] = -np.inf
     best = int(np.argmax(margin))
-    return (invert_pose(T_object_hand[best]), q_start[best]) if np.isfinite(margin[best]) else None
+    return (grasps[of_grasp[best]], q_start[best]) if np.isfinite(margin[best]) else None
 
 
 def _is_clear(

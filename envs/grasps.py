@@ -6,7 +6,7 @@ Hand frame = `panda_hand_tcp`: z is the approach direction, the fingers close al
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -49,8 +49,17 @@ class Grasp:
         return invert_pose(self.T_object_hand)
 
     @property
+    def is_flat(self) -> bool:
+        """Whether the pads lie on a wall."""
+        return self.kind == "body"
+
+    @property
     def fits_hand(self) -> bool:
         return self.width_m <= MAX_WIDTH_M
+
+    def told(self) -> dict[str, Any]:
+        """What a reference's header says of it (JSON-like)."""
+        return {"kind": self.kind, "width_m": self.width_m, "fits": self.fits_hand}
 
 
 def grasp_candidates(vessel: Vessel) -> list[Grasp]:
@@ -71,7 +80,7 @@ def held_grasps(vessel: Vessel, contents_kg: float, T_object: Array) -> list[Gra
     """
 
     def weighed(grasps: list[Grasp]) -> list[tuple[float, Grasp]]:
-        parts = [weight_part(vessel, contents_kg, T_object, g.T_hand_object, g.width_m) for g in grasps]
+        parts = [weight_part(vessel, contents_kg, T_object, g.T_hand_object, g.width_m, g.is_flat) for g in grasps]
         return [
             (part, replace(g, cost=g.cost + _HOLD_COST * max(part - _EASY, 0.0)))
             for part, g in zip(parts, grasps, strict=True)

@@ -114,7 +114,7 @@ def build_reference(
             "seen": receptacle_track is not None,
         },
         "T_hand_object": placement.grasp.T_hand_object.tolist(),
-        "grasp": {"kind": placement.grasp.kind, "width_m": placement.grasp.width_m, "fits": placement.grasp.fits_hand},
+        "grasp": placement.grasp.told(),
         "q_start_rad": placement.q_rad[0].tolist(),
         "scale": factor,
         "scale_chosen": "auto" if scale == "auto" else "given",

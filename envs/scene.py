@@ -152,7 +152,8 @@ def build_scene(
 def _pressing_n(reference: Reference, vessel: Vessel, receptacle: Vessel | None) -> float:
     """What each finger presses with on the vessel, filled as usual, along the reference."""
     T, width_m = reference.T_hand_object, 2.0 * gripper_half_width_m(vessel, reference.T_hand_object)
-    return pressing_n(weight_part(vessel, filling_kg(vessel, receptacle), reference.T_world_object, T, width_m))
+    contents_kg, flat = filling_kg(vessel, receptacle), reference.header.get("grasp", {}).get("kind") == "body"
+    return pressing_n(weight_part(vessel, contents_kg, reference.T_world_object, T, width_m, flat))
 
 
 def particle_obstacles(model: mujoco.MjModel, body: str) -> list[Box]:

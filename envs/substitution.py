@@ -37,11 +37,12 @@ def with_vessel(reference: Reference, vessel: Vessel) -> Reference:
     shift_m = R_pour @ (np.asarray(old.outlet.point_m, float) - np.asarray(vessel.outlet.point_m, float))
     moved = _moved(reference, lift_m, shift_m)
     contents_kg = filling_kg(vessel, reference.receptacle() if reference.has_receptacle else None)
-    T_hand_object, q_start_rad = reachable_grasp(vessel, moved.T_world_object, contents_kg)
+    grasp, q_start_rad = reachable_grasp(vessel, moved.T_world_object, contents_kg)
     return moved.with_header(
         vessel=vessel_to_header(vessel),
         symmetry=vessel.symmetry.to_json(),
-        T_hand_object=T_hand_object.tolist(),
+        T_hand_object=grasp.T_hand_object.tolist(),
+        grasp=grasp.told(),
         q_start_rad=q_start_rad.tolist(),
     )
 

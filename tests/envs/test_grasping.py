@@ -57,7 +57,7 @@ def test_a_heavy_kettle_may_be_held_across_its_handle_with_a_finger_inside() -> 
     usual, held = grasp_candidates(kettle), held_grasps(kettle, 0.2, T)
 
     def part(grasp: Grasp) -> float:
-        return weight_part(kettle, 0.2, T, grasp.T_hand_object, grasp.width_m)
+        return weight_part(kettle, 0.2, T, grasp.T_hand_object, grasp.width_m, grasp.is_flat)
 
     assert len(held) > len(usual)
     assert min(map(part, usual)) > HOLDS
