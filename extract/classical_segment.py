@@ -11,13 +11,16 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
 from .protocols import Box, Image, Mask, Proposal
 from .segment import mask_box, mask_from_box, mask_from_silhouette
 
-BORDER, SMALLEST, LARGEST = 0.04, 0.001, 0.3  # of a side; of the picture's area
+BORDER, SMALLEST, LARGEST = 0.04, 0.001, 0.5  # of a side; of the picture's area
+BINS, RARE = 24, 0.9  # of Lab's axes; share of the pixels of a colour, evened out for area, that lie inside
 WORK_SIDE_PX = 640
 RECUT_EVERY, RECUT_BAND_PX = 3, 5
+GAP_PX = 3  # between parts of one object, such as where a thin handle was lost
 
 
 @dataclass(frozen=True)
@@ -33,15 +36,15 @@ class ClassicalSegmenter:
         """
         height, width = rgb.shape[:2]
         scale = min(1.0, WORK_SIDE_PX / max(height, width))
-        small = cv2.resize(rgb, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-        h, w = small.shape[:2]
-        inner = (BORDER * w, BORDER * h, (1 - 2 * BORDER) * w, (1 - 2 * BORDER) * h)
-        if min(inner[2:]) < 8:
+        small = np.asarray(cv2.resize(rgb, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
+        if min(small.shape[:2]) < 16:
             return []
-        unlike = mask_from_box(np.asarray(small, np.uint8), inner, iterations=3)
-        blobs = cv2.morphologyEx(unlike.astype(np.uint8), cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
+        unlike = _unlike_border(small)
+        if unlike.any():
+            unlike = mask_from_silhouette(small, unlike, RECUT_BAND_PX)
+        blobs = cv2.morphologyEx(unlike.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((GAP_PX, GAP_PX), np.uint8))
         _, parts, stats, _ = cv2.connectedComponentsWithStats(blobs)
-        areas = stats[:, cv2.CC_STAT_AREA] / (h * w)
+        areas = stats[:, cv2.CC_STAT_AREA] / blobs.size
         found = []
         for part in 1 + np.argsort(-areas[1:], kind="stable"):
             if not SMALLEST < areas[part] < LARGEST:
@@ -71,6 +74,21 @@ class ClassicalSegmenter:
                 current = np.stack(moved)
             before = grey
             yield current.copy()
+
+
+def _unlike_border(rgb: Image) -> Mask:
+    """(H, W) what has colours that are RARE in the picture's border, by smoothed histograms, without specks."""
+    lab = cv2.cvtColor(rgb, cv2.COLOR_RGB2LAB)
+    edge = min(max(2, round(BORDER * max(rgb.shape[:2]))), min(rgb.shape[:2]) // 4)
+    inside = np.zeros(rgb.shape[:2], np.uint8)
+    inside[edge:-edge, edge:-edge] = 1
+    shares = []
+    for part in (inside, 1 - inside):
+        counts = cv2.calcHist([lab], [0, 1, 2], part, [BINS] * 3, [0.0, 256.0] * 3)
+        shares.append(gaussian_filter(counts, 0.7) / int(part.sum()))
+    cell = tuple((lab * (BINS / 256)).astype(int).transpose(2, 0, 1))
+    rare = (shares[0] / (shares[0] + shares[1] + 1e-9))[cell] > RARE
+    return np.asarray(cv2.medianBlur(rare.astype(np.uint8) & inside, 3) > 0)
 
 
 def _solidity(mask: Mask) -> float:
