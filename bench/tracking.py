@@ -61,6 +61,7 @@ def main() -> None:
     parser.add_argument("--rows", nargs="*", metavar="NAME", help="real rows to measure; all when left out")
     parser.add_argument("--synthetic", type=int, default=5, metavar="N", help="synthetic clips, up to 40")
     parser.add_argument("--boxes", action="store_true", help="give the object's box in the synthetic clips as well")
+    parser.add_argument("--depth", action="store_true", help="and the pictures of a depth camera")
     parser.add_argument("--shared", type=Path, default=Path(__file__).parents[2] / "shared")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--only", help=argparse.SUPPRESS)  # one row, in this process
@@ -74,7 +75,7 @@ def main() -> None:
     if unknown := [name for name in names if name not in REAL]:
         parser.error(f"no row {', '.join(unknown)}; there are {', '.join(REAL)}")
     # By category first: five clips are five categories.
-    suffix = ":box" if arguments.boxes else ""
+    suffix = (":box" if arguments.boxes else "") + (":depth" if arguments.depth else "")
     names += [f"{c}:{seed}{suffix}" for seed in range(5) for c in CATEGORIES][: arguments.synthetic]
     rows: list[Row] = []
     for name in names:
@@ -141,13 +142,16 @@ def box_turn(data: Path, folder: Path) -> list[Row]:
 
 def synthetic(name: str, folder: Path) -> list[Row]:
     category, seed, *given = name.split(":")
-    clip = synthesize(category, int(seed), folder)
+    clip = synthesize(category, int(seed), folder, depth="depth" in given)
     truth = load_truth(clip.truth_path)
     box = tuple(float(v) for v in clip.boxes_xywh_px["object"])
-    request = ObjectRequest(category, box if given else None)
-    track, row = _extracted(clip.video, request, truth.camera_matrix, folder)
-    row["given"] = "category, camera, box" if given else "category, camera"
+    request = ObjectRequest(category, box if "box" in given else None)
+    depth = folder / "depth" if "depth" in given else None
+    track, row = _extracted(clip.video, request, truth.camera_matrix, folder, depth)
+    row["given"] = ", ".join(["category", "camera", *given])
     row |= _errors(track, truth, None)
+    far_m, far_truth_m = (np.linalg.norm(t.T_camera_object[:, :3, 3], axis=1) for t in (track, truth))
+    row["distance_mm"] = 1e3 * float(np.mean(np.abs(far_m - far_truth_m)))
     library = clip.truth.header["mesh"]["library"]
     model = make_vessel(library["category"], None, **library["params"]).mesh
     return [row, *_beside(clip.video, box, truth, model, False)]
@@ -161,7 +165,9 @@ REAL: dict[str, Callable[[Path, Path], list[Row]]] = {
 }
 
 
-def _extracted(video: Path, request: ObjectRequest, camera: np.ndarray | None, folder: Path) -> tuple[ObjectTrack, Row]:
+def _extracted(
+    video: Path, request: ObjectRequest, camera: np.ndarray | None, folder: Path, depth: Path | None = None
+) -> tuple[ObjectTrack, Row]:
     """The track, with frames a second of all of extraction but the start, and the peak memory of this process.
 
     Seconds are of processor time, so that what else runs on the machine does not count.
@@ -176,7 +182,7 @@ def _extracted(video: Path, request: ObjectRequest, camera: np.ndarray | None, f
         None if camera is None else tuple(float(v) for v in (camera[0, 0], camera[1, 1], camera[0, 2], camera[1, 2]))
     )
     begin_s = time.process_time()
-    track = extract(video, [request], out=folder / "out", camera=given, progress=mark)[request.name]
+    track = extract(video, [request], out=folder / "out", camera=given, depth=depth, progress=mark)[request.name]
     end_s = time.process_time()
     started_s = next((t for t, what in marks if "looking" not in what), end_s)
     row: Row = {"visible_percent": 100 * float(track.visible.mean())}
@@ -288,6 +294,7 @@ def _box_tracker(
 COLUMNS = {
     "clip": "clip", "given": "given", "aligned_deg": "aligned rot., deg", "e_rot": "e_rot", "e_proj": "e_proj",
     "adds_auc_percent": "ADD-S AUC, %", "worst_stretch": "worst stretch", "projected_percent": "projected, %",
+    "distance_mm": "distance, mm",
     "tilt_deg": "tilt, deg", "tip_px": "spout tip, px", "visible_percent": "visible, %", "start_s": "start, s",
     "fps": "fps", "peak_mb": "peak, MB",
 }  # fmt: skip

@@ -21,10 +21,14 @@ DRAWN_SIDE_PX = 40.0  # of the object, where its surface is sampled
 LEAST_COSINE = 0.25  # between surface and line of sight: flatter ones are seen badly by any sensor
 SAME_SIDE, SAME_SIZE = float(np.cos(np.deg2rad(4.0))), 0.1  # of poses that one drawing serves
 LIMITS_M = (0.06, 0.03, 0.02, 0.012, 0.012, 0.012)  # beyond which a reading is not the object's, coarse to fine
-FLOOR_M, GROWTH_PER_M = 0.003, 0.0019  # standard deviation of a reading: of sensor and mesh, and with distance squared
-INDEPENDENT = 100  # points that all together tell as much as: a sensor's errors, and a mesh's, are alike side by side
+FLOOR_M, GROWTH_PER_M = 0.003, 0.0019  # standard deviation of a reading, near by and with distance squared
+INDEPENDENT = 100  # readings that all together tell as much as: a sensor's errors are alike side by side
+LIKENESS = 0.05  # of its radius, by which the surface of a mesh that is only like the object's is beside it
+INDEPENDENT_PARTS = 10  # of such a mesh: where one point of it is off, the next is so too
 FEWEST = 30  # readings, with fewer of which nothing is said
 OUTLINE_DEPTH = 0.02  # of the distance: no better does an outline know it, which may run a pixel beside the object's
+BEFORE_M = 0.02  # and BEFORE times the standard deviation before the surface something else is seen
+BEFORE, BESIDE = 4.0, 2.0  # standard deviations: before the surface, where a hand is; beside it
 SIZE_SPREAD = 0.5  # of the distance: nearer and farther ones do not count when sizes are told
 
 
@@ -77,14 +81,19 @@ def size_told(surface: Surface, T_camera_object: Array, view: DepthView) -> floa
     return float(np.median(ratio)) if len(ratio) >= FEWEST else None
 
 
-def settle(surface: Surface, T_camera_object: Array, view: DepthView, information: Array) -> Array | None:
+def settle(
+    surface: Surface, T_camera_object: Array, view: DepthView, information: Array, mesh_error_m: float = 0.0
+) -> Array | None:
     """The pose (4, 4) that explains both what was known of it and the depth seen; None when too little was seen.
 
     information: (6, 6) of the pose given, rotation about the object first, in the units of its least squares.
+    mesh_error_m: standard deviation of the mesh's surface from the object's; 0 for the object's own.
     """
     T = T_camera_object.copy()
     information = _less_sure_of_distance(information, T[:3, 3])
-    for limit_m in LIMITS_M:
+    floor_m = float(np.hypot(FLOOR_M, mesh_error_m))
+    independent = INDEPENDENT_PARTS if mesh_error_m > 0 else INDEPENDENT
+    for limit_m in np.maximum(LIMITS_M, 3 * mesh_error_m):
         point, z, measured, normal = _read(surface, T, view)
         slope = np.sum(normal * point, axis=1) / z
         offset_m = np.where(measured > 0, slope * (measured - z), np.inf)
@@ -92,8 +101,8 @@ def settle(surface: Surface, T_camera_object: Array, view: DepthView, informatio
         if near.sum() < FEWEST:
             return None
         point, normal, slope, offset_m = point[near], normal[near], slope[near], offset_m[near]
-        variance = FLOOR_M**2 + (slope * GROWTH_PER_M * z[near] ** 2) ** 2
-        weight = (1 - (offset_m / limit_m) ** 2) ** 2 / variance * min(1.0, INDEPENDENT / near.sum())
+        variance = floor_m**2 + (slope * GROWTH_PER_M * z[near] ** 2) ** 2
+        weight = (1 - (offset_m / limit_m) ** 2) ** 2 / variance * min(1.0, independent / near.sum())
         rows = np.concatenate([np.cross(point - T[:3, 3], normal), normal], axis=1)
         weighted = rows * weight[:, None]
         turned = Rotation.from_matrix(T[:3, :3] @ T_camera_object[:3, :3].T).as_rotvec()
@@ -101,6 +110,24 @@ def settle(surface: Surface, T_camera_object: Array, view: DepthView, informatio
         step = np.linalg.solve(weighted.T @ rows + information, weighted.T @ offset_m - information @ gone)
         T = make_pose(Rotation.from_rotvec(step[:3]).as_matrix() @ T[:3, :3], T[:3, 3] + step[3:])
     return T
+
+
+def share_on_surface(
+    surface: Surface, T_camera_object: Array, view: DepthView, mesh_error_m: float = 0.0
+) -> float | None:
+    """Share of the readings, but those of what stands before the mesh, that lie on its surface.
+
+    0 where all are before it, None where there are too few.
+
+    A pose that leans the wrong way, which an outline often cannot tell, has a third of them beside it.
+    """
+    point, z, measured, normal = _read(surface, T_camera_object, view)
+    sigma_m = float(np.hypot(FLOOR_M, mesh_error_m))
+    behind_m = (measured - z) * np.abs(np.sum(normal * point, axis=1)) / z
+    told = (measured > 0) & (behind_m > -max(BEFORE_M, BEFORE * sigma_m))
+    if np.count_nonzero(measured) < FEWEST:
+        return None
+    return float(np.mean(np.abs(behind_m[told]) < BESIDE * sigma_m)) if told.sum() >= FEWEST else 0.0
 
 
 def _less_sure_of_distance(information: Array, position_m: Array) -> Array:

@@ -28,18 +28,31 @@ SAME_SHAPE = 0.01  # of the sides' ratio, by which a depth picture may differ fr
 
 @dataclass(frozen=True)
 class DepthView:
-    """One depth picture: metres (H, W) along the camera's z, 0 where nothing was read; camera_matrix (3, 3) at it."""
+    """One depth picture: steps (H, W) along the camera's z, step_m long, 0 or not finite where nothing was read.
 
-    metres: NDArray[np.float32]
+    camera_matrix: (3, 3) of the picture.
+    """
+
+    steps: NDArray[Any]
     camera_matrix: Array
+    step_m: float = 1.0
+
+    @property
+    def metres(self) -> NDArray[np.float32]:
+        """(H, W) depth in m, 0 where nothing was read."""
+        return np.asarray(self._metres(self.steps), np.float32)
+
+    def _metres(self, steps: NDArray[Any]) -> Array:
+        metres = steps.astype(float) * self.step_m
+        return np.where(np.isfinite(metres) & (metres > 0), metres, 0.0)
 
     def at(self, pixel: Array) -> Array:
         """(N,) m at pixels (N, 2), 0 where nothing was read and outside of the picture."""
-        height, width = self.metres.shape
+        height, width = self.steps.shape
         with np.errstate(invalid="ignore"):
             x, y = np.round(np.clip(np.nan_to_num(pixel, nan=-9.0), -9, 1e6)).astype(int).T
         inside = (x >= 0) & (y >= 0) & (x < width) & (y < height)
-        return np.where(inside, self.metres[y * inside, x * inside], 0.0).astype(float)
+        return np.where(inside, self._metres(self.steps[y * inside, x * inside]), 0.0)
 
 
 @dataclass(frozen=True)
@@ -93,10 +106,8 @@ class DepthVideo:
                 f"--depth {self.path}: picture {index} has {steps.shape[1]} x {steps.shape[0]} px, the first {width} x "
                 f"{height}; make them equal"
             )
-        metres = np.nan_to_num(steps.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0)
-        metres *= np.float32(self.scale_mm * M_PER_MM)
         smaller = np.diag([width / size_px[0], height / size_px[1], 1.0])
-        return DepthView(np.maximum(metres, 0), smaller @ camera_matrix)
+        return DepthView(steps, smaller @ camera_matrix, self.scale_mm * M_PER_MM)
 
     def described(self, sizes: bool) -> dict[str, Any]:
         """For the track's header. sizes: whether the object's size was read off the depth."""

@@ -84,7 +84,8 @@ class Followed:
         symmetry: of the mesh, where it is not a vessel's.  background: of the clip, where it is known.
         """
         symmetry = symmetry if vessel is None else vessel.symmetry
-        tracker = ObjectTracker(mesh, camera_matrix, rgb, mask, T_camera_object, symmetry, background)
+        exact = vessel is None
+        tracker = ObjectTracker(mesh, camera_matrix, rgb, mask, T_camera_object, symmetry, background, exact)
         return Followed(mesh, vessel, camera_matrix, mask, tracker, guesses)
 
     def step(self, rgb: Image, index: int, frame_count: int, depth: DepthView | None = None) -> None:

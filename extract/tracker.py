@@ -17,18 +17,19 @@ from scipy.spatial.transform import Rotation
 
 from .background import Background
 from .colours import HIDDEN_BIN, ColourModel, colour_bins
-from .depth_term import Surface, draw_surface, settle
+from .depth_term import LIKENESS, Surface, draw_surface, settle, share_on_surface
 from .depth_video import DepthView
 from .first_pose import share_on_edges
 from .geometry import Array, Symmetry, make_pose, project, scaled_camera, transform_points
 from .raster import render_depth
 from .region import Outline, TrackingMesh, draw_outline, edge_strength, measure, refine
 from .segment import Mask
-from .spin import object_evidence
+from .spin import mirrored, object_evidence
 from .texture import NO_MATCHES, Matches, Texture, flattened
 from .video import Image
 
 LOGISTIC = (5.26, 2.42, 2.27, -3.29)
+ON_SURFACE = 0.9  # least share of the depth readings on a right pose's mesh
 LEARNING_RATE = 0.15
 LEARN_ABOVE = 0.5  # a frame the tracker is unsure of teaches it nothing
 KEY_ABOVE = 0.8
@@ -108,6 +109,12 @@ class _Fit:
     strain: float = 0.0
     signs: Signs = Signs(0.0, 0.0, 0.0)
     farther: float = 1.0  # than outline and texture alone would have it, by the depth picture
+    on_surface: float = 1.0  # share of the depth readings that lie on the mesh
+
+    @property
+    def merit(self) -> float:
+        """What fits of one frame are compared by: the confidence, less where depth readings speak against the pose."""
+        return self.confidence * min(1.0, self.on_surface / ON_SURFACE)
 
 
 class ObjectTracker:
@@ -115,7 +122,7 @@ class ObjectTracker:
 
     camera_matrix and all images are at the working resolution.  symmetry: of the mesh; about an axis of revolution
     only texture can tell a turn, without it there is none.  background: of the clip, where it is known: tells what
-    may hide the object.
+    may hide the object.  exact: whether the mesh is the object's own, or only like it.
     """
 
     def __init__(
@@ -127,6 +134,7 @@ class ObjectTracker:
         T_camera_object: Array,
         symmetry: Symmetry | None = None,
         background: Background | None = None,
+        exact: bool = True,
     ):
         self.mesh, self.camera_matrix = mesh, camera_matrix
         self.symmetry = symmetry or Symmetry()
@@ -136,7 +144,7 @@ class ObjectTracker:
         self.textured_frames = 0
         self._depth: DepthView | None = None
         self._surface: Surface | None = None
-        self._farther = 1.0
+        self._farther, self._mesh_error_m = 1.0, 0.0 if exact else LIKENESS * mesh.radius_m
         self._pose: Array = T_camera_object
         self._velocity: Array = np.zeros(6)
         self._lost_frames, self._size_px = 0, (rgb.shape[1], rgb.shape[0])
@@ -166,8 +174,12 @@ class ObjectTracker:
             # A guess from a first look that went astray is given up for where the second look has come.
             other_part = self._around(rgb, ahead)
             other = self._fitted(other_part, ahead, spin=HELD_SPIN_RAD)
-            if other.confidence > best.confidence + GUESS_MARGIN:
+            if other.merit > best.merit + GUESS_MARGIN:
                 part, best = other_part, other
+        if best.on_surface < ON_SURFACE:
+            # An outline leans toward the camera as well as away from it: depth knows better.
+            other = self._fitted(part, mirrored(best.T_camera_object), spin=HELD_SPIN_RAD)
+            best = other if other.merit > best.merit + GUESS_MARGIN else best
         if best.confidence < LOST_BELOW:
             part = self._part(rgb, 0, 0, rgb.shape[1], rgb.shape[0])
             best = self._searched(part, best, start)
@@ -256,7 +268,7 @@ class ObjectTracker:
         told = outline.select(part.bins[y, x] != HIDDEN_BIN)
         signs = Signs(agree, share_on_edges(told, part.edges), rigid)
         confidence = signs.confidence * min(1.0, 2 * in_view)
-        return _Fit(T, confidence, outline, matches, result.strain, signs, farther)
+        return _Fit(T, confidence, outline, matches, result.strain, signs, farther, self._on_surface(T))
 
     def _with_depth(self, T: Array, information: Array, spin_rad: float) -> tuple[Array, float]:
         """A pose of that information (6, 6) joined with what the depth picture says, and how much farther that is."""
@@ -268,11 +280,20 @@ class ObjectTracker:
         up = T[:3, :3] @ np.asarray(self.symmetry.axis)
         held = np.diag([1 / 0.03**2] * 3 + [1 / (0.02 * T[2, 3]) ** 2] * 3)
         held[:3, :3] += np.outer(up, up) * (1 / spin_rad**2 - 1 / 0.03**2)
-        settled = None if self._surface is None else settle(self._surface, T, self._depth, information + held)
+        settled = None
+        if self._surface is not None:
+            settled = settle(self._surface, T, self._depth, information + held, self._mesh_error_m)
         if settled is None:
             # Where nothing was read the outline is as wrong about the distance as it was before.
             return make_pose(T[:3, :3], T[:3, 3] * self._farther), self._farther
         return settled, float(np.linalg.norm(settled[:3, 3]) / np.linalg.norm(T[:3, 3]))
+
+    def _on_surface(self, T: Array) -> float:
+        """See `_Fit`; 1 where there is no depth."""
+        if self._depth is None or self._surface is None:
+            return 1.0
+        share = share_on_surface(self._surface, T, self._depth, self._mesh_error_m)
+        return 1.0 if share is None else share
 
     def _searched(self, part: _Part, best: _Fit, predicted: Array) -> _Fit:
         """The best of wider looks: around the prediction at first, then wherever the object's colours are."""

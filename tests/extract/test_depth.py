@@ -9,18 +9,15 @@ import numpy as np
 import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
-from vid2demo.extract.candidates import ObjectRequest
 from vid2demo.extract.depth_size import scaled_vessel, size_of_clip
 from vid2demo.extract.depth_term import Surface, draw_surface, settle, size_told
 from vid2demo.extract.depth_video import DepthVideo, DepthView
 from vid2demo.extract.errors import UserError
 from vid2demo.extract.geometry import focal_prior_camera_matrix, make_pose, transform_points
-from vid2demo.extract.perceive import extract
 from vid2demo.extract.raster import render_depth
 from vid2demo.extract.region import TrackingMesh
 from vid2demo.extract.shape_fit import tracking_mesh
 from vid2demo.extract.steps import ObjectSettings, VideoSettings
-from vid2demo.extract.synthetic import synthesize
 from vid2demo.extract.synthetic_depth import sensed_depth
 from vid2demo.extract.tracker import ObjectTracker
 from vid2demo.extract.vessels import make_vessel
@@ -312,19 +309,3 @@ def test_with_depth_an_object_is_as_far_away_as_it_is(clip: Path, tmp_path: Path
     assert off_m[1][-1] > 0.015
     assert off_m[0].max() < 0.006
     assert off_m[0][-1] < 0.25 * off_m[1][-1]
-
-
-@pytest.mark.slow
-def test_with_depth_a_vessel_of_the_library_has_its_size_and_distance(tmp_path: Path) -> None:
-    clip = synthesize("mug", 0, tmp_path / "clip", seconds=2.0, fps=15.0, depth=True)
-    camera = tuple(clip.truth.camera_matrix[[0, 1, 0, 1], [0, 1, 2, 2]])
-    box = tuple(float(v) for v in clip.boxes_xywh_px["object"])
-    off_m = {}
-    for name, depth in (("with", clip.video.parent / "depth"), ("without", None)):
-        request = ObjectRequest("mug", box)
-        track = extract(clip.video, [request], out=tmp_path / name, camera=camera, depth=depth)["mug"]
-        off_m[name] = float(np.abs(track.T_camera_object[:, 2, 3] - clip.truth.T_camera_object[:, 2, 3]).mean())
-        told = None if depth is None else {"file": "depth", "scale_mm": 1.0, "size_source": "depth"}
-        assert track.header["settings"].get("depth") == told
-    assert off_m["with"] < 0.006
-    assert off_m["with"] < 0.6 * off_m["without"]
