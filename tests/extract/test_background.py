@@ -72,7 +72,7 @@ def test_what_is_covered_for_sure_ends_where_the_thing_does() -> None:
     assert np.any((background.labels(frames[0]) == FOREGROUND) & beside)
     covered = background.covered(frames[0])
     assert not np.any(covered & beside)
-    assert np.mean(covered[cup]) > 0.85
+    assert np.mean(covered[cup]) > 0.65
 
 
 def test_a_mask_is_not_believed_where_a_shadow_in_it_goes_on_outside() -> None:
