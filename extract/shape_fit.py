@@ -24,7 +24,7 @@ from .vessels import Vessel, make_vessel, outline_mesh, parameter_space
 
 FIXED = ("wall_m", "red", "green", "blue")  # not seen in a silhouette
 PRIOR_SHARE = 0.15  # standard deviation of a shape parameter around its start, as a share of its range
-PRIOR_TURN_RAD, PRIOR_SHIFT = 0.07, 0.03  # standard deviation of a pose around its start; of the distance
+PRIOR_TURN_RAD, PRIOR_SHIFT = 0.1, 0.03  # standard deviation of a pose around its start; of the distance
 TRACKING_FACES = 8000
 BOX_STD_PX = 4.0  # how exactly people draw boxes
 
