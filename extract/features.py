@@ -63,7 +63,8 @@ class ClassicalFeatures:
         mean, axes = _summary_axes()
         # Of nothing the summary is zero, not what the mean lacks.
         off = np.where(coarse.any(axis=1, keepdims=True), coarse - mean, np.float32(0))
-        return PatchGrid(patches, unit(off @ axes))
+        # In doubles, so that how many threads share the product does not show.
+        return PatchGrid(patches, unit(np.asarray(off.astype(float) @ axes.astype(float), np.float32)))
 
 
 def crop_cells(rgb: NDArray[np.uint8], mask: NDArray[np.bool_], grid: int) -> Floats:
