@@ -13,13 +13,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from .depth_video import DepthView
-from .geometry import Array, invert_pose, make_pose, project, transform_points
+from .geometry import Array, invert_pose, make_pose, pose_change, project, shows_same_side, transform_points
 from .raster import render_depth
 from .region import TrackingMesh
 
 DRAWN_SIDE_PX = 40.0  # of the object, where its surface is sampled
 LEAST_COSINE = 0.25  # between surface and line of sight: flatter ones are seen badly by any sensor
-SAME_SIDE, SAME_SIZE = float(np.cos(np.deg2rad(4.0))), 0.1  # of poses that one drawing serves
+SAME_SIDE_RAD, SAME_SIZE = float(np.deg2rad(4.0)), 0.1  # of poses that one drawing serves
 LIMITS_M = (0.06, 0.03, 0.02, 0.012, 0.012, 0.012)  # beyond which a reading is not the object's, coarse to fine
 FLOOR_M, GROWTH_PER_M = 0.003, 0.0019  # standard deviation of a reading, near by and with distance squared
 INDEPENDENT = 100  # readings that all together tell as much as: a sensor's errors are alike side by side
@@ -42,9 +42,7 @@ class Surface:
 
     def serves(self, T_camera_object: Array) -> bool:
         """Whether the object shows nearly the same side and size at a pose as where the surface was drawn."""
-        towards, drawn = (T[:3, :3].T @ T[:3, 3] for T in (T_camera_object, self.T_drawn))
-        far, far_drawn = float(np.linalg.norm(towards)), float(np.linalg.norm(drawn))
-        return bool(towards @ drawn > SAME_SIDE * far * far_drawn and abs(far / far_drawn - 1) < SAME_SIZE)
+        return shows_same_side(T_camera_object, self.T_drawn, SAME_SIDE_RAD, SAME_SIZE)
 
 
 def draw_surface(mesh: TrackingMesh, T_camera_object: Array, camera_matrix: Array) -> Surface | None:
@@ -105,9 +103,8 @@ def settle(
         weight = (1 - (offset_m / limit_m) ** 2) ** 2 / variance * min(1.0, independent / near.sum())
         rows = np.concatenate([np.cross(point - T[:3, 3], normal), normal], axis=1)
         weighted = rows * weight[:, None]
-        turned = Rotation.from_matrix(T[:3, :3] @ T_camera_object[:3, :3].T).as_rotvec()
-        gone = np.concatenate([turned, T[:3, 3] - T_camera_object[:3, 3]])
-        step = np.linalg.solve(weighted.T @ rows + information, weighted.T @ offset_m - information @ gone)
+        gone = information @ pose_change(T_camera_object, T)
+        step = np.linalg.solve(weighted.T @ rows + information, weighted.T @ offset_m - gone)
         T = make_pose(Rotation.from_rotvec(step[:3]).as_matrix() @ T[:3, :3], T[:3, 3] + step[3:])
     return T
 

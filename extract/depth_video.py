@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import UserError
-from .geometry import Array
+from .geometry import Array, scaled_camera
 from .video import VideoInfo
 
 M_PER_MM = 1e-3
@@ -106,8 +106,8 @@ class DepthVideo:
                 f"--depth {self.path}: picture {index} has {steps.shape[1]} x {steps.shape[0]} px, the first {width} x "
                 f"{height}; make them equal"
             )
-        smaller = np.diag([width / size_px[0], height / size_px[1], 1.0])
-        return DepthView(steps, smaller @ camera_matrix, self.scale_mm * M_PER_MM)
+        camera = scaled_camera(camera_matrix, width / size_px[0], height / size_px[1])
+        return DepthView(steps, camera, self.scale_mm * M_PER_MM)
 
     def described(self, sizes: bool) -> dict[str, Any]:
         """For the track's header. sizes: whether the object's size was read off the depth."""

@@ -64,7 +64,7 @@ class ClassicalFeatures:
         # Of nothing the summary is zero, not what the mean lacks.
         off = np.where(coarse.any(axis=1, keepdims=True), coarse - mean, np.float32(0))
         # In doubles, so that how many threads share the product does not show.
-        return PatchGrid(patches, unit(np.asarray(off.astype(float) @ axes.astype(float), np.float32)))
+        return PatchGrid(patches, unit(np.asarray(off.astype(float) @ axes, np.float32)))
 
 
 def crop_cells(rgb: NDArray[np.uint8], mask: NDArray[np.bool_], grid: int) -> Floats:
@@ -108,10 +108,10 @@ def pooled(cells: Floats) -> Floats:
 
 
 @functools.cache
-def _summary_axes() -> tuple[Floats, Floats]:
+def _summary_axes() -> tuple[Floats, NDArray[np.float64]]:
     """Mean (P,) and axes (P, E) of the summary."""
     with np.load(SUMMARY_AXES) as stored:
-        return np.asarray(stored["mean"], np.float32), np.asarray(stored["axes"], np.float32)
+        return np.asarray(stored["mean"], np.float32), np.asarray(stored["axes"], np.float64)
 
 
 @functools.lru_cache(maxsize=4)

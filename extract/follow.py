@@ -193,9 +193,9 @@ class Followed:
 
     def _sized(self, poses: Array, vessel: Vessel) -> tuple[Vessel, Array]:
         """The vessel as large as the depth pictures say, and its poses as far away; unchanged without any."""
-        told = [g for g in self.glimpses if g.depth is not None and self.estimates[g.index].confidence > SURE]
-        seen = [(poses[g.index], g.depth) for g in told if g.depth is not None]
-        ratio = size_of_clip(tracking_mesh(vessel), seen)
+        sure = [g for g in self.glimpses if self.estimates[g.index].confidence > SURE]
+        seen = [(poses[g.index], g.depth) for g in sure if g.depth is not None]
+        ratio = size_of_clip(tracking_mesh(vessel), seen) if seen else None
         if ratio is None:
             return vessel, poses
         poses = poses.copy()

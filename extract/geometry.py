@@ -105,13 +105,30 @@ def project(camera_matrix: Array, points_camera_m: Array) -> Array:
     return uvw[..., :2] / uvw[..., 2:]
 
 
-def scaled_camera(camera_matrix: Array, scale: float) -> Array:
+def scaled_camera(camera_matrix: Array, scale: float, scale_y: float | None = None) -> Array:
     """(3, 3) intrinsics in px of the same picture made `scale` times as large by averaging or interpolation.
 
-    Centres of pixels lie at integers (OpenCV), so that a picture begins half a pixel before 0 at any size.
+    scale_y: how many times as high, where that differs. Centres of pixels lie at integers (OpenCV), so that a picture
+    begins half a pixel before 0 at any size.
     """
-    shift = (scale - 1) / 2
-    return np.asarray(np.array([[scale, 0.0, shift], [0.0, scale, shift], [0.0, 0.0, 1.0]]) @ camera_matrix)
+    sx, sy = scale, scale if scale_y is None else scale_y
+    return np.asarray(np.array([[sx, 0.0, (sx - 1) / 2], [0.0, sy, (sy - 1) / 2], [0.0, 0.0, 1.0]]) @ camera_matrix)
+
+
+def shows_same_side(T_a: Array, T_b: Array, side_rad: float, size: float) -> bool:
+    """Whether an object shows nearly the same side at two poses T_camera_object (4, 4), and as large.
+
+    side_rad: most between the directions from which the camera sees it.  size: most change of distance, as a share.
+    """
+    a, b = (T[:3, :3].T @ T[:3, 3] for T in (T_a, T_b))
+    far_a, far_b = float(np.linalg.norm(a)), float(np.linalg.norm(b))
+    return bool(a @ b > np.cos(side_rad) * far_a * far_b and abs(far_a / far_b - 1) < size)
+
+
+def pose_change(T_from: Array, T_to: Array) -> Array:
+    """(6,) change from one pose to another about the object: rotation vector in the camera's axes, then shift in m."""
+    turn = Rotation.from_matrix(T_to[:3, :3] @ T_from[:3, :3].T).as_rotvec()
+    return np.concatenate([turn, T_to[:3, 3] - T_from[:3, 3]])
 
 
 def projected_box(

@@ -19,13 +19,13 @@ from scipy.spatial.transform import Rotation
 
 from .colours import HIDDEN_BIN, LOCAL_CENTRES, ColourModel
 from .creases import Creases, draw_creases
-from .geometry import Array, invert_pose, make_pose, project, transform_points
+from .geometry import Array, invert_pose, make_pose, project, shows_same_side, transform_points
 from .raster import render_depth
 from .region_kernels import free_lengths, learn_lines, measure_lines, solve_pose, strongest_gradient
 from .video import Image
 
 CLEAR_EDGE = 24.0  # grey levels per px
-SAME_SIDE, SAME_SIZE = float(np.cos(np.deg2rad(1.5))), 0.05  # of views that one outline serves
+SAME_SIDE_RAD, SAME_SIZE = float(np.deg2rad(1.5)), 0.05  # of views that one outline serves
 POINT_LIMIT_PX = 3.0
 CREASE_WEIGHT = 0.1  # against the outline: a vessel of the library has its creases about there, not just there
 NO_EDGES = np.zeros((0, 0, 2), np.float32)
@@ -95,9 +95,7 @@ class Outline:
 
     def serves(self, T_camera_object: Array) -> bool:
         """Whether the object shows nearly the same side and size at a pose as where the outline was drawn."""
-        towards, drawn = (T[:3, :3].T @ T[:3, 3] for T in (T_camera_object, self.T_drawn))
-        far, far_drawn = float(np.linalg.norm(towards)), float(np.linalg.norm(drawn))
-        return bool(towards @ drawn > SAME_SIDE * far * far_drawn and abs(far / far_drawn - 1) < SAME_SIZE)
+        return shows_same_side(T_camera_object, self.T_drawn, SAME_SIDE_RAD, SAME_SIZE)
 
     def moved(self, T_camera_object: Array, camera_matrix: Array) -> Outline:
         """The same points of the mesh where another pose and camera show them."""

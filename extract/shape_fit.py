@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from .colours import ColourModel
-from .geometry import Array, project, transform_points
+from .geometry import Array, pose_change, project, transform_points
 from .raster import render_depth
 from .region import Lines, TrackingMesh, measure
 from .segment import Box
@@ -115,7 +115,7 @@ def fit_shape(
             pose_prior = np.array([1 / PRIOR_TURN_RAD**2] * 3 + [1 / (PRIOR_SHIFT * T[2, 3]) ** 2] * 3)
             own = slice(6 * slot, 6 * slot + 6)
             normal[own, own] += np.diag(pose_prior)
-            gradient[own] -= pose_prior * _twist(views[k].T_camera_object, T)
+            gradient[own] -= pose_prior * pose_change(views[k].T_camera_object, T)
         tail = slice(6 * len(used), size)
         normal[tail, tail] += np.diag(1 / prior_std**2)
         gradient[tail] -= (values - start) / prior_std**2
@@ -139,12 +139,6 @@ def _surface(category: str, params: dict[str, float]) -> Surface:
 
 def _with(vessel: Vessel, changes: dict[str, float]) -> Vessel:
     return make_vessel(vessel.category, None, **{**vessel.params, **{k: float(v) for k, v in changes.items()}})
-
-
-def _twist(T_from: Array, T: Array) -> Array:
-    """(6,) what `_moved` would have to be given to come from one pose to another, turn first."""
-    turn = Rotation.from_matrix(T[:3, :3] @ T_from[:3, :3].T).as_rotvec()
-    return np.concatenate([turn, T[:3, 3] - T_from[:3, 3]])
 
 
 def _moved(T: Array, delta: Array) -> Array:

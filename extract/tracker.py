@@ -20,7 +20,7 @@ from .colours import HIDDEN_BIN, ColourModel, colour_bins
 from .depth_term import LIKENESS, Surface, draw_surface, settle, share_on_surface
 from .depth_video import DepthView
 from .first_pose import share_on_edges
-from .geometry import Array, Symmetry, make_pose, project, scaled_camera, transform_points
+from .geometry import Array, Symmetry, make_pose, pose_change, project, scaled_camera, transform_points
 from .raster import render_depth
 from .region import Outline, TrackingMesh, draw_outline, edge_strength, measure, refine
 from .segment import Mask
@@ -202,8 +202,7 @@ class ObjectTracker:
         """Go on from a fit, and learn from it what it is sure enough to teach."""
         T = fit.T_camera_object
         if self._lost_frames == 0:
-            turn = Rotation.from_matrix(T[:3, :3] @ self._pose[:3, :3].T).as_rotvec()
-            self._velocity = np.concatenate([turn, T[:3, 3] - self._pose[:3, 3]])
+            self._velocity = pose_change(self._pose, T)
         else:
             self._velocity = np.zeros(6)
         self._pose, self._lost_frames, self._farther = T, 0, fit.farther
