@@ -128,5 +128,6 @@ def test_broken_numbers_are_one_clear_error(tmp_path: Path, fault: str) -> None:
         arrays = {name: archive[name] for name in archive.files}
     arrays["T_camera_object"][7, 0, 3] = np.nan if fault == "nan" else np.inf
     np.savez(tmp_path / "kettle.track.npz", **arrays)
-    with pytest.raises(UserError, match=r"kettle\.track\.npz is not a valid track: .* not finite"):
+    told = r"kettle\.track\.npz is not a valid track: .* not finite \(first in frame 7, 1 in all\); write such frames"
+    with pytest.raises(UserError, match=told):
         ObjectTrack.load(tmp_path / "kettle.track.npz")

@@ -48,7 +48,9 @@ def test_other_programs_can_read_it_without_pickle(tmp_path: Path) -> None:
     ("changes", "words"),
     [
         ({"time_s": np.array([0.0, 0.1, 0.1, 0.2, 0.3])}, "strictly increasing"),
-        ({"T_camera_object": np.full((5, 4, 4), np.nan)}, "not finite"),
+        ({"T_camera_object": np.full((5, 4, 4), np.nan)}, r"not finite \(first in frame 0, 5 in all\); write"),
+        ({"confidence": np.array([1.0, 1.0, np.inf, 1.0, np.nan])}, "first in frame 2, 2 in all"),
+        ({"camera_matrix": np.full((3, 3), np.nan)}, "give the camera again"),
         ({"confidence": np.zeros(4)}, "shape"),
     ],
 )
