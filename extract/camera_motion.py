@@ -4,6 +4,8 @@ Corners outside the objects are followed from a key frame by sparse optical flow
 fitted to them robustly. It is exact for a camera that only turns and for a flat background; a hand-held camera's
 small sway is near enough to the first, a moving one in a deep scene is neither, which the quality tells. When a key
 frame has lost its corners the present frame takes its place; homographies are chained over key frames, not frames.
+Corners that are left keep their numbers, and where each was seen is kept for `camera_path`, which tells how the camera
+moved through such a scene: everything in frames that show something new, a few dozen in those between.
 """
 
 from __future__ import annotations
@@ -28,6 +30,9 @@ INLIER_PX = 1.5
 STILL_PX, STILL_SHARE = 0.5, 0.3  # so many corners that have not moved mean a still camera: the others are things
 STATIC_SHARE = 0.004  # of the diagonal: background that never strays farther, in its 95th percentile, stands still
 OBJECT_MARGIN = 0.15  # of the box, left out around it: hands and shadows move with the object
+NEW_VIEW_SHARE = 0.02  # of the longer side, that corners have moved since the last frame of which everything is kept
+STANDS_SHARE = 0.9  # of the corners, far and near, that have not moved: then the camera has not
+KEPT_BETWEEN = 60  # corners of a frame between those
 TURN_SHARE = 0.85  # of the corners that fit a homography: when so many fit a rotation too, it is a rotation
 
 
@@ -72,6 +77,20 @@ def compensated(T_camera_object: Array, motion: CameraMotion) -> Array:
     return out
 
 
+@dataclass(frozen=True)
+class Sighting:
+    """Where corners are in one frame.
+
+    ids: (M,) numbers of the corners, the same in every frame.  pixels: (M, 2) of the frames worked on.
+    view: everything was kept, because the frame shows the scene from a new side. While the camera stands, its frames
+    share one sighting.
+    """
+
+    ids: NDArray[np.int32]
+    pixels: NDArray[np.float32]
+    view: bool
+
+
 @dataclass
 class _KeyFrame:
     """A frame that corners are followed from: its motion, how many corners it had, those left, then and now."""
@@ -80,6 +99,7 @@ class _KeyFrame:
     R_key_first: Array
     grey: Image
     count: int
+    ids: NDArray[np.int32]
     start: NDArray[np.float32]
     now: NDArray[np.float32]
 
@@ -88,10 +108,12 @@ class _KeyFrame:
 class CameraWatch:
     """Watches the background of a clip frame by frame; `result` may be asked for at any time.
 
-    camera_matrix: (3, 3) at the size of the frames given to `step`. Of each frame only its homography is kept.
+    camera_matrix: (3, 3) at the size of the frames given to `step`. Of each frame its homography is kept, and its
+    `sightings`: None where no corner could be followed.
     """
 
     camera_matrix: Array
+    sightings: list[Sighting | None] = field(default_factory=list)
     _key: _KeyFrame | None = None
     _before: Image | None = None
     _shape: tuple[int, int] = (0, 0)
@@ -99,6 +121,13 @@ class CameraWatch:
     _H: list[Array] = field(default_factory=list)
     _R: list[Array] = field(default_factory=list)
     _quality: list[tuple[float, float]] = field(default_factory=list)
+    _view: Sighting | None = None
+    _next_id: int = 0
+
+    @property
+    def working_camera(self) -> Array:
+        """(3, 3) at the size of the frames worked on, that of the sightings."""
+        return scaled_camera(self.camera_matrix, self._scale)
 
     def step(self, rgb: Image, leave_out: Mask | None = None, boxes: list[Box] | None = None) -> None:
         """Take the next frame, (H, W, 3).
@@ -116,7 +145,8 @@ class CameraWatch:
         if self._key is not None and self._before is not None:
             H, R, quality, turn_quality = self._followed(self._key, self._before, image, background)
         if self._key is None or quality == 0.0 or len(self._key.now) < KEPT_SHARE * self._key.count:
-            self._renew(H, R, image, background)
+            self._renew(H, R, image, background, followed=quality > 0)
+        self._note()
         self._before = image
         self._H.append(H)
         self._R.append(R)
@@ -172,7 +202,7 @@ class CameraWatch:
         good = there & back & free & (np.linalg.norm(settled - key.start, axis=1) < ROUND_TRIP_PX)
         if good.sum() < FEWEST_CORNERS // 2:
             return lost
-        key.start, key.now = key.start[good], now[good]
+        key.ids, key.start, key.now = key.ids[good], key.start[good], now[good]
         offset = np.linalg.norm(key.now - key.start, axis=1)
         still = float(np.mean(offset < STILL_PX))
         if still > STILL_SHARE and still * len(offset) >= FEWEST_CORNERS // 2:
@@ -182,8 +212,8 @@ class CameraWatch:
         H, inlier = fit
         if H is None:
             return lost
-        K = scaled_camera(self.camera_matrix, self._scale)
-        R, share = _rotation(key.start.astype(float), key.now.astype(float), K, inlier[:, 0] > 0)
+        K = self.working_camera
+        R, share = fitted_rotation(key.start.astype(float), key.now.astype(float), K, inlier[:, 0] > 0)
         quality = float(np.mean(inlier))
         if share >= TURN_SHARE * quality:
             # Three numbers instead of eight: a homography's perspective is mostly noise when the camera only turns.
@@ -191,11 +221,44 @@ class CameraWatch:
         H = np.asarray(H @ key.H_key_first)
         return H / H[2, 2], R @ key.R_key_first, quality, share
 
-    def _renew(self, H: Array, R: Array, image: Image, background: Image) -> None:
+    def _renew(self, H: Array, R: Array, image: Image, background: Image, *, followed: bool) -> None:
+        """Make the present frame the key frame: the corners that were followed to it, and new ones away from them."""
         spacing = max(4.0, 0.012 * max(image.shape))
-        corners = cv2.goodFeaturesToTrack(image, MOST_CORNERS, 0.005, spacing, mask=background, blockSize=5)
+        ids, kept = np.zeros(0, np.int32), np.zeros((0, 2), np.float32)
+        if followed and self._key is not None:
+            ids, kept = self._key.ids, self._key.now
+        free = background.copy()
+        for x, y in np.round(kept).astype(int):
+            cv2.circle(free, (int(x), int(y)), round(spacing), 0, -1)
+        wanted = max(MOST_CORNERS - len(kept), 1)
+        corners = cv2.goodFeaturesToTrack(image, wanted, 0.005, spacing, mask=free, blockSize=5)
         found = np.zeros((0, 2), np.float32) if corners is None else np.asarray(corners[:, 0], np.float32)
-        self._key = _KeyFrame(H, R, image, len(found), found, found.copy())
+        fresh = np.arange(self._next_id, self._next_id + len(found), dtype=np.int32)
+        self._next_id += len(found)
+        start = np.concatenate([kept, found])
+        self._key = _KeyFrame(H, R, image, len(start), np.concatenate([ids, fresh]), start, start.copy())
+
+    def _note(self) -> None:
+        """Keep where the corners are: all of them in a frame that shows something new, few in others."""
+        key = self._key
+        if key is None or len(key.now) < FEWEST_CORNERS // 2:
+            self.sightings.append(None)
+            return
+        view = self._view
+        if view is not None:
+            _, a, b = np.intersect1d(view.ids, key.ids, return_indices=True)
+            moved = np.linalg.norm(view.pixels[a] - key.now[b], axis=1)
+            common = len(a) >= KEPT_SHARE * len(key.ids)
+            if common and np.mean(moved < STILL_PX) > STANDS_SHARE:
+                self.sightings.append(view)
+                return
+            # Near things move more than far ones, and it is the near ones that tell.
+            if common and np.percentile(moved, 75) < NEW_VIEW_SHARE * max(self._shape) * self._scale:
+                few = np.unique(np.linspace(0, len(key.ids) - 1, KEPT_BETWEEN).astype(int))
+                self.sightings.append(Sighting(key.ids[few], key.now[few], False))
+                return
+        self._view = Sighting(key.ids, key.now, True)
+        self.sightings.append(self._view)
 
 
 def _flow(
@@ -215,7 +278,7 @@ def _moved(H: Array, pixels: Array) -> Array:
     return np.asarray(uvw[:, :2] / uvw[:, 2:])
 
 
-def _rotation(start: Array, now: Array, K: Array, inlier: NDArray[np.bool_]) -> tuple[Array, float]:
+def fitted_rotation(start: Array, now: Array, K: Array, inlier: NDArray[np.bool_]) -> tuple[Array, float]:
     """Rotation between two views (M, 2) px of far points, robust, and the share of points that agree with it."""
     rays = [np.column_stack([p, np.ones(len(p))]) @ np.linalg.inv(K).T for p in (start, now)]
     a, b = (r / np.linalg.norm(r, axis=1, keepdims=True) for r in rays)

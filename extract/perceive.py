@@ -15,7 +15,7 @@ import numpy as np
 
 from .background import COVERED, SAMPLES, Background, learn_background
 from .both_ways import Clip, Watched, follow_both_ways, settle_rivals
-from .camera_motion import CameraWatch
+from .camera_of_tracks import with_camera
 from .candidates import Model, vessel_model
 from .candidates import ObjectRequest as ObjectRequest
 from .candidates import candidate_models as candidate_models
@@ -38,7 +38,6 @@ from .track import ObjectTrack
 from .video import Image, VideoInfo, iterate_frames, read_video_info, sample_frames
 
 TRUSTED_CONFIDENCE = 0.6  # mean over the clip, of an object that nobody pointed at
-SURE_OF_CAMERA = 0.5  # median share of the background that agrees on how the camera turned
 LESS_SURE = 0.05  # of confidence, that a focal length told by the clip may cost: noise, if it is right
 SURELY_FOLLOWED = 0.65  # mean confidence over the clip, below which it is tried from another frame as well
 AWAY_FRAMES, FOLLOWED_THERE, ELSEWHERE_MARGIN = 12, 0.4, 0.15  # least distance, confidence and gain of that
@@ -144,7 +143,6 @@ def extract(
         best, camera_told = _with_told_focal(best, requests, models, report, camera_motion != "static")
     scene, index, starts, followed, watched = best.scene, best.index, best.starts, best.followed, best.watched
     time_s = np.array([watched.times[k] for k in sorted(watched.times)])
-    R_first_camera, motion_words = _camera_turns(watched.camera, camera_motion)
 
     tracks: dict[str, ObjectTrack] = {}
     for request, start, result in zip(requests, starts, followed, strict=True):
@@ -155,12 +153,13 @@ def extract(
         model = start.best.model if result.vessel is None else vessel_model(result.vessel)
         smooth = smooth_poses(raw, time_s, confidence * visible)
         header = _header(request, scene, start, model, index)
-        header["camera"] = {**camera_told, "motion": motion_words}
+        header["camera"] = camera_told
         header["video"]["cuts"] = [{"frame": c.index, "time_s": round(c.time_s, 4)} for c in watched.cuts.cuts]
         header["settings"] |= {"spin_source": result.spin_source, "seed": seed}
         tracks[request.name] = ObjectTrack(
-            smooth, time_s, scene.camera_matrix, confidence, visible, header, R_first_camera, raw
+            smooth, time_s, scene.camera_matrix, confidence, visible, header, T_camera_object_raw=raw
         )
+    tracks = with_camera(tracks, watched.camera, camera_motion)
 
     items = [OverlayItem(track, f.mesh) for track, f in zip(tracks.values(), followed, strict=True)]
     write_tracks(info, items, [start.best.mask for start in starts], out, rerun=rerun, progress=report)
@@ -268,20 +267,6 @@ def _with_told_focal(
     # What it would still change is as uncertain as what it is sure of.
     std_px = focal_px * float(np.hypot(again.log_std, np.log(again.factor)))
     return second, {"source": "estimated", "focal_px": round(focal_px, 1), "std_px": round(std_px, 1)}
-
-
-def _camera_turns(watch: CameraWatch | None, asked: str) -> tuple[Array | None, dict[str, Any]]:
-    """Orientation of each frame's camera in the first one's, None for a still camera; and that for the header."""
-    if watch is None:
-        return None, {"asked": asked, "kind": "static"}
-    motion = watch.result()
-    quality = round(float(np.median(motion.quality)), 3)
-    told = {"asked": asked, "stray_px": round(motion.stray_px, 2), "quality": quality}
-    # A rotation is a poor account of a camera that moves sideways, but better than none for one said to move.
-    turns = (motion.rotates_only and quality > SURE_OF_CAMERA) if asked == "auto" else not motion.static
-    if turns:
-        return motion.R_first_camera, {**told, "kind": "turning"}
-    return None, {**told, "kind": "static" if motion.static else "moving, not compensated"}
 
 
 def _found(

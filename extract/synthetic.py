@@ -22,6 +22,7 @@ from .files import atomic_path, write_json
 from .geometry import Array, invert_pose
 from .offscreen import load_mujoco
 from .progress import Progress
+from .synthetic_camera import CAMERA_PATHS, CameraPath, move_camera
 from .synthetic_depth import sensed_depth
 from .synthetic_hand import Grip, grips
 from .synthetic_motion import Camera, PourPath, PourShape, place_camera, plan_pour
@@ -76,6 +77,7 @@ def synthesize(
     occluder: bool = True,
     noise: bool = True,
     depth: bool = False,
+    camera_path: CameraPath = "still",
     progress: Progress | None = None,
 ) -> SyntheticClip:
     """Render a seeded pour into `out`: video.mp4, truth.track.npz, receptacle.track.npz and settings.json.
@@ -83,10 +85,12 @@ def synthesize(
     category, receptacle: library vessels (a word that names several, such as "kettle", draws one of them).
     size: (width, height) in px, even.  occluder: a hand and forearm.  noise: sensor noise, blur and white balance;
     the video is compressed either way.  depth: also write the pictures of a depth camera at the same place, in mm, with
-    its noise and holes, to the folder `depth`. Equal arguments give equal poses and equal pictures on one machine.
-    Raises UserError for an unknown category, an impossible size, length or rate.
+    its noise and holes, to the folder `depth`.  camera_path: the camera stands still, turns in place by a few degrees
+    (pan, tilt and roll), or is carried around the table; the tracks then hold its exact T_first_camera. Equal
+    arguments give equal poses and equal pictures on one machine.
+    Raises UserError for an unknown category or camera path, an impossible size, length or rate.
     """
-    _check(seconds, fps, size)
+    _check(seconds, fps, size, camera_path)
     out = Path(out)
     rng = np.random.default_rng(seed)
     names = {"object": _choose(rng, category), "receptacle": _choose(rng, receptacle)}
@@ -100,6 +104,8 @@ def synthesize(
     )
     path = plan_pour(rng, shape, seconds, fps)
     camera, height_share = place_camera(rng, path, shape, size)
+    # Drawn apart, so that a clip is the same whether or not its camera could move.
+    camera, T_world_camera = move_camera(np.random.default_rng([seed, 2]), camera, path, shape, size, camera_path)
     sensor = Sensor(rng, size) if noise else None
     video, count = out / "video.mp4", len(path.time_s)
     visible = np.zeros(count)
@@ -109,7 +115,8 @@ def synthesize(
     if depth:
         shutil.rmtree(out / DEPTH_FOLDER, ignore_errors=True)  # of a longer clip
     choices: list[Grip | None] = [*grips(rng, vessel.grasps)] if occluder else [None]
-    with _scene(scene_seed, vessel, bowl, path, camera, size, choices) as scene, VideoWriter(video, fps) as writer:
+    scene = _scene(scene_seed, vessel, bowl, path, camera, T_world_camera, size, choices)
+    with scene, VideoWriter(video, fps) as writer:
         notes = scene.notes
         for k in range(count):
             picture = scene.render(k)
@@ -138,6 +145,7 @@ def synthesize(
         "occluder": occluder,
         "noise": noise,
         "depth": depth,
+        "camera_path": camera_path,
         "versions": {"mujoco": load_mujoco().__version__, "numpy": np.__version__, "opencv": cv2.__version__},
         "boxes_xywh_px": boxes,
         "camera_matrix": camera.camera_matrix.tolist(),
@@ -161,16 +169,23 @@ def synthesize(
     common = {
         "image_size_px": list(size),
         "video": {"file": video.name, "sha256": info.sha256, "frames": count},
-        "camera": {"source": "given", "pixel_convention": "centre of the first pixel is (0, 0)"},
+        "camera": {
+            "source": "given",
+            "pixel_convention": "centre of the first pixel is (0, 0)",
+            "motion": {"kind": {"still": "static", "turn": "turning", "walk": "moving"}[camera_path]},
+        },
         "settings": {"made_by": "synthesize", "seed": seed, "exact": True},
     }
     T_receptacle = np.tile(path.T_world_receptacle, (count, 1, 1))
     tracks = {
-        "truth": _track(vessel, names["object"], camera, path.T_world_object, info.time_s, visible, common),
+        "truth": _track(
+            vessel, names["object"], camera, T_world_camera, path.T_world_object, info.time_s, visible, common
+        ),
         "receptacle": _track(
             bowl,
             names["receptacle"] if names["receptacle"] != names["object"] else "receptacle",
             camera,
+            T_world_camera,
             T_receptacle,
             info.time_s,
             np.ones(count),
@@ -192,7 +207,9 @@ def synthesize(
     )
 
 
-def _check(seconds: float, fps: float, size: tuple[int, int]) -> None:
+def _check(seconds: float, fps: float, size: tuple[int, int], camera_path: str) -> None:
+    if camera_path not in CAMERA_PATHS:
+        raise UserError(f"camera_path is {camera_path!r}; give one of {', '.join(CAMERA_PATHS)}")
     if not 1 <= fps <= 240:
         raise UserError(f"fps is {fps:g}; give a frame rate between 1 and 240")
     if not 0.5 < seconds * fps <= MAX_FRAMES:
@@ -212,6 +229,7 @@ def _scene(
     receptacle: Vessel,
     path: PourPath,
     camera: Camera,
+    T_world_camera: Array,
     size_px: tuple[int, int],
     choices: Sequence[Grip | None],
 ) -> Scene:
@@ -219,7 +237,7 @@ def _scene(
     frames = np.linspace(0, len(path.time_s) - 1, 6).astype(int)
 
     def built(grip: Grip | None) -> Scene:
-        return Scene(np.random.default_rng(seed), vessel, receptacle, path, camera, size_px, grip)
+        return Scene(np.random.default_rng(seed), vessel, receptacle, path, camera, size_px, grip, T_world_camera)
 
     least = []
     for grip in choices:
@@ -243,6 +261,7 @@ def _track(
     vessel: Vessel,
     name: str,
     camera: Camera,
+    T_world_camera: Array,
     T_world_object: Array,
     time_s: Array,
     visible_fraction: Array,
@@ -258,13 +277,16 @@ def _track(
         "up_axis": [0.0, 0.0, 1.0],
         "library": _library(vessel),
     }
+    moves = np.ptp(T_world_camera, axis=0).max() > 0
+    T_first_camera = np.asarray(invert_pose(T_world_camera[0]) @ T_world_camera) if moves else None
     return ObjectTrack(
-        T_camera_object=np.asarray(invert_pose(camera.T_world_camera) @ T_world_object),
+        T_camera_object=np.asarray(invert_pose(T_world_camera) @ T_world_object),
         time_s=time_s,
         camera_matrix=camera.camera_matrix,
         confidence=np.ones(len(time_s)),
         visible=visible_fraction > VISIBLE_FRACTION,
         header={"object": name, "mesh": mesh, **common},
+        T_first_camera=T_first_camera,
     )
 
 

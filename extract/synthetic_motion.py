@@ -87,7 +87,7 @@ def plan_pour(rng: np.random.Generator, shape: PourShape, seconds: float, fps: f
     lower = minimum_jerk((u - 0.36 - late[2]) / 0.26)
     back = minimum_jerk((u - 0.78 - late[3]) / 0.24)
 
-    sway = _sway(rng, time_s, 6) * minimum_jerk(u / 0.15)
+    sway = unsteady(rng, time_s, 6) * minimum_jerk(u / 0.15)
     yaw = yaw_start + (heading - yaw_start) * carry + sway[0] * np.deg2rad(1.0)
     tilt = tilt_max * (tilt_in - rng.uniform(0.3, 0.6) * back) + sway[1] * np.deg2rad(0.8)
     roll = sway[2] * np.deg2rad(1.2) + np.deg2rad(rng.uniform(-5, 5)) * tilt_in
@@ -181,7 +181,7 @@ def _collides(T: Array, points: Array, receptacle_reach_m: float, rim_m: float) 
     return False
 
 
-def _sway(rng: np.random.Generator, time_s: Array, channels: int) -> Array:
+def unsteady(rng: np.random.Generator, time_s: Array, channels: int) -> Array:
     """(channels, N) unsteadiness of about unit size: three sines between 0.4 and 3 Hz, slow ones larger."""
     hz = rng.uniform([0.4, 0.8, 1.6], [0.8, 1.6, 3.0], (channels, 3))
     phase = rng.uniform(0, 2 * np.pi, (channels, 3))

@@ -26,7 +26,10 @@ OBJECT, RECEPTACLE, HAND = SCENERY + 1, SCENERY + 2, SCENERY + 3
 
 
 class Scene(Studio):
-    """A built scene: `render(k)` gives the clean picture of frame k, `labels(k)` its exact segmentation."""
+    """A built scene: `render(k)` gives the clean picture of frame k, `labels(k)` its exact segmentation.
+
+    T_world_camera: (N, 4, 4) where the camera is in every frame; when None it stays where it is.
+    """
 
     def __init__(
         self,
@@ -37,9 +40,10 @@ class Scene(Studio):
         camera: Camera,
         size_px: tuple[int, int],
         grip: Grip | None,
+        T_world_camera: Array | None = None,
     ) -> None:
         super().__init__(rng, camera, size_px, (0.45, 0.9))
-        self._path = path
+        self._path, self._T_world_camera = path, T_world_camera
         self._clutter(path)
         self._add_vessel("object", vessel, OBJECT)
         self._add_vessel("receptacle", receptacle, RECEPTACLE)
@@ -82,6 +86,8 @@ class Scene(Studio):
         T = self._moving[k]
         self._data.mocap_pos[:] = T[:, :3, 3]
         self._data.mocap_quat[:] = Rotation.from_matrix(T[:, :3, :3]).as_quat(scalar_first=True)
+        if self._T_world_camera is not None:
+            self._move_camera(self._T_world_camera[k])
         self._place()
 
     def _clutter(self, path: PourPath) -> None:

@@ -155,10 +155,15 @@ class Studio:
         self._depth, self._turn = depth, turn
 
     def _add_camera(self, camera: Camera) -> None:
-        quat = Rotation.from_matrix(camera.T_world_camera[:3, :3] @ _OPENCV_TO_OPENGL).as_quat(scalar_first=True)
+        T = camera.T_world_camera
         self._spec.worldbody.add_camera(
-            name="camera", pos=camera.T_world_camera[:3, 3], quat=quat, fovy=np.rad2deg(camera.fovy_rad)
+            name="camera", pos=T[:3, 3], quat=_camera_quat(T), fovy=np.rad2deg(camera.fovy_rad)
         )
+
+    def _move_camera(self, T_world_camera: Array) -> None:
+        """Put the built room's camera elsewhere; seen after `_place`."""
+        self._model.cam_pos[0] = T_world_camera[:3, 3]
+        self._model.cam_quat[0] = _camera_quat(T_world_camera)
 
     def _add_mesh(self, name: str, mesh: Any, look: Look, T_world_mesh: Array | None, group: int) -> None:
         """A mesh with its look; without a pose it can be moved (mocap)."""
@@ -178,6 +183,11 @@ class Studio:
             quat = Rotation.from_matrix(T_world_mesh[:3, :3]).as_quat(scalar_first=True)
             body = self._spec.worldbody.add_body(name=name, pos=T_world_mesh[:3, 3], quat=quat)
         body.add_geom(type=self._mujoco.mjtGeom.mjGEOM_MESH, meshname=name, material=material, group=group)
+
+
+def _camera_quat(T_world_camera: Array) -> Array:
+    """(4,) wxyz of MuJoCo's camera axes."""
+    return np.asarray(Rotation.from_matrix(T_world_camera[:3, :3] @ _OPENCV_TO_OPENGL).as_quat(scalar_first=True))
 
 
 class Sensor:

@@ -16,8 +16,8 @@ from .files import atomic_path
 from .geometry import Array, Symmetry
 
 SCHEMA = "vid2demo/object-track"
-SCHEMA_VERSION = 1
-OPTIONAL = ("R_first_camera", "T_camera_object_raw")  # arrays that a file may lack
+SCHEMA_VERSION = 2  # 2: T_first_camera, where 1 had R_first_camera, of cameras that turn in place only
+OPTIONAL = ("T_first_camera", "T_camera_object_raw")  # arrays that a file may lack
 
 
 @dataclass(frozen=True)
@@ -31,8 +31,8 @@ class ObjectTrack:
     visible: (N,) bool, False where the object is out of view or lost.
     header: JSON-like; `object`, `mesh` (name, sha256, extents_m, symmetry, up_axis, and for library vessels
         `library` = {category, params}), `image_size_px` [w, h], `video`, `camera`, `settings`.
-    R_first_camera: (N, 3, 3) orientation of each frame's camera in the first frame's, of a camera that turns in
-        place; None for one that stands still.
+    T_first_camera: (N, 4, 4) pose of each frame's camera in the first frame's, in m; its translation is zero for a
+        camera that turns in place. None for one that stands still.
     T_camera_object_raw: (N, 4, 4) the poses before smoothing; None where they were not smoothed.
     """
 
@@ -42,7 +42,7 @@ class ObjectTrack:
     confidence: Array
     visible: np.ndarray[Any, np.dtype[np.bool_]]
     header: Mapping[str, Any] = field(default_factory=dict)
-    R_first_camera: Array | None = None
+    T_first_camera: Array | None = None
     T_camera_object_raw: Array | None = None
 
     def __post_init__(self) -> None:
@@ -54,8 +54,8 @@ class ObjectTrack:
             "confidence": (n,),
             "visible": (n,),
         }
-        if self.R_first_camera is not None:
-            expected["R_first_camera"] = (n, 3, 3)
+        if self.T_first_camera is not None:
+            expected["T_first_camera"] = (n, 4, 4)
         if self.T_camera_object_raw is not None:
             expected["T_camera_object_raw"] = (n, 4, 4)
         for name, shape in expected.items():
@@ -83,25 +83,20 @@ class ObjectTrack:
 
     def from_first_camera(self) -> ObjectTrack:
         """The same motion as the camera of the first frame would have seen it, had it stood still."""
-        if self.R_first_camera is None:
+        if self.T_first_camera is None:
             return self
-        turned = []
-        for poses in (self.T_camera_object, self.T_camera_object_raw):
-            T = None if poses is None else np.array(poses, float)
-            if T is not None:
-                T[:, :3] = self.R_first_camera @ T[:, :3]
-            turned.append(T)
-        assert turned[0] is not None
-        return replace(self, T_camera_object=turned[0], T_camera_object_raw=turned[1], R_first_camera=None)
+        raw = None if self.T_camera_object_raw is None else self.T_first_camera @ self.T_camera_object_raw
+        seen = np.asarray(self.T_first_camera @ self.T_camera_object)
+        return replace(self, T_camera_object=seen, T_camera_object_raw=raw, T_first_camera=None)
 
     def save(self, path: Path) -> None:
         """Write `*.track.npz` atomically."""
         header = {
-            "schema": SCHEMA,
-            "version": SCHEMA_VERSION,
             "units": {"length": "m", "time": "s", "image": "px"},
             "frames": {"camera": "OpenCV: x right, y down, z forward", "pose": "T_camera_object: object in camera"},
             **self.header,
+            "schema": SCHEMA,
+            "version": SCHEMA_VERSION,  # this file's, not that of the one the track was read from
         }
         optional = {name: getattr(self, name) for name in OPTIONAL}
         extra: dict[str, Any] = {k: np.asarray(v, np.float64) for k, v in optional.items() if v is not None}
@@ -119,16 +114,27 @@ class ObjectTrack:
 
     @staticmethod
     def load(path: Path) -> ObjectTrack:
-        """Read a track. Raises UserError when the file is missing, damaged or of another kind."""
+        """Read a track of any version. Raises UserError when the file is missing, damaged or of another kind."""
         arrays, header = load_npz_with_header(Path(path), SCHEMA, SCHEMA_VERSION)
         names = ("T_camera_object", "time_s", "camera_matrix", "confidence", "visible")
         if missing := [name for name in names if name not in arrays]:
             raise UserError(f"{path} lacks {', '.join(missing)}; write it again with `vid2demo extract`")
         try:
+            if "R_first_camera" in arrays:  # version 1
+                arrays["T_first_camera"] = _turning(arrays["R_first_camera"])
             optional = {name: arrays[name] for name in OPTIONAL if name in arrays}
             return ObjectTrack(**{name: arrays[name] for name in names}, header=header, **optional)
         except ValueError as error:
             raise UserError(f"{path} is not a valid track: {error}") from error
+
+
+def _turning(R_first_camera: Array) -> Array:
+    """(N, 4, 4) poses of a camera that turns in place."""
+    if R_first_camera.ndim != 3 or R_first_camera.shape[1:] != (3, 3):
+        raise ValueError(f"R_first_camera has shape {R_first_camera.shape}, expected (N, 3, 3)")
+    T = np.tile(np.eye(4), (len(R_first_camera), 1, 1))
+    T[:, :3, :3] = R_first_camera
+    return T
 
 
 def _not_finite(name: str, value: Array, frames: int) -> str:

@@ -103,3 +103,47 @@ def test_a_failed_write_keeps_the_old_file(tmp_path: Path, monkeypatch: pytest.M
         some_track(7).save(path)
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
+
+
+def walked(n: int = 5) -> np.ndarray:
+    """T_first_camera of a camera that turns about y while it is carried to the right."""
+    T = np.tile(np.eye(4), (n, 1, 1))
+    angle = 0.1 * np.arange(n)
+    T[:, 0, 0] = T[:, 2, 2] = np.cos(angle)
+    T[:, 0, 2], T[:, 2, 0] = np.sin(angle), -np.sin(angle)
+    T[:, 0, 3] = 0.2 * np.arange(n)
+    return T
+
+
+def test_a_thing_at_rest_stays_at_rest_in_the_first_cameras_frame(tmp_path: Path) -> None:
+    T_first_camera = walked()
+    resting = np.eye(4)
+    resting[:3, 3] = 0.1, 0.2, 0.9
+    seen = np.linalg.inv(T_first_camera) @ resting
+    some_track(T_camera_object=seen, T_camera_object_raw=seen, T_first_camera=T_first_camera).save(tmp_path / "a")
+    back = ObjectTrack.load(tmp_path / "a").from_first_camera()
+    assert back.T_first_camera is None
+    for poses in (back.T_camera_object, back.T_camera_object_raw):
+        assert poses is not None
+        assert poses == pytest.approx(np.tile(resting, (5, 1, 1)), abs=1e-12)
+
+
+def test_files_of_turning_cameras_written_by_version_1_are_read(tmp_path: Path) -> None:
+    path, turned = tmp_path / "old.track.npz", walked()[:, :3, :3]
+    some_track().save(path)
+    with np.load(path, allow_pickle=False) as archive:
+        arrays = dict(archive)
+    header = {**json.loads(str(arrays.pop("header"))), "version": 1}
+    with open(path, "wb") as stream:
+        np.savez(stream, **arrays, R_first_camera=turned, header=np.array(json.dumps(header)))
+    track = ObjectTrack.load(path)
+    assert track.T_first_camera is not None
+    np.testing.assert_array_equal(track.T_first_camera[:, :3, :3], turned)
+    assert not track.T_first_camera[:, :3, 3].any()
+    track.save(path)  # as version 2, so that no older program takes the camera for still
+    with np.load(path, allow_pickle=False) as archive:
+        assert json.loads(str(archive["header"]))["version"] == 2
+    with open(path, "wb") as stream:
+        np.savez(stream, **arrays, R_first_camera=turned[:, 0], header=np.array(json.dumps(header)))
+    with pytest.raises(UserError, match="R_first_camera has shape"):
+        ObjectTrack.load(path)
