@@ -16,7 +16,7 @@ from .export import commands_of
 from .grip import grip_of
 from .limits import LIMITS, Extreme, commanded, extremes
 from .retarget import Solver, retarget, tracking_errors
-from .variants import nearest_variant
+from .variants import Variant, freed_of, nearest_variant
 
 if TYPE_CHECKING:
     from ..envs.reference import Reference
@@ -42,11 +42,31 @@ def feasibility(reference: Reference, joints: JointTrajectory) -> dict[str, Any]
     """
     findings, problems = _findings(reference, joints)
     findings["feasible"] = not problems
-    findings["variant"] = _variant(reference, joints, findings) if problems else None
+    variant = _variant(reference, joints, findings, problems) if problems else None
+    findings["variant"] = variant and variant.told(reference)
     note = joints.header.get("solver", {}).get("note")
-    said = [findings["variant"]["words"]] if findings["variant"] else []
+    said = [variant.words] if variant else []
     findings["words"] = [*_words(findings, problems, said), *([note] if note else []), *reference.notes]
     return findings
+
+
+def without_contact(reference: Reference) -> Reference:
+    """The reference free of touching table and receptacle, where that is all that is wrong and a little mends it.
+
+    The whole path is raised, or the receptacle moved, by at most 5 cm, whichever is less; a note and `changed` in the
+    header say so. Everything else, what needs more included, comes back as it is, for the report to tell.
+    """
+    joints = retarget(reference, strict=False)
+    findings, problems = _findings(reference, joints)
+    if not _only_touches(findings, problems):
+        return reference
+    variant = _variant(reference, joints, findings, problems)
+    return variant.taken(findings["collisions"]) if variant and variant.is_small else reference
+
+
+def _only_touches(findings: dict[str, Any], problems: list[str]) -> bool:
+    collisions = findings["collisions"]
+    return 0 < len(problems) == len(collisions) and bool(freed_of(collisions))
 
 
 def _findings(reference: Reference, joints: JointTrajectory) -> tuple[dict[str, Any], list[str]]:
@@ -185,18 +205,24 @@ def _limit(extreme: Extreme) -> dict[str, Any]:
     }
 
 
-def _variant(reference: Reference, joints: JointTrajectory, findings: dict[str, Any]) -> dict[str, Any] | None:
+def _variant(
+    reference: Reference, joints: JointTrajectory, findings: dict[str, Any], problems: list[str]
+) -> Variant | None:
     """The nearest motion found that is feasible; see `nearest_variant`."""
     parts = {name: entry["part"] for name, entry in findings["limits"].items()}
     speed = max(max(entry["value"] for entry in findings["speed_part_of_limit"]), parts["speed"])
     slower = max(speed, parts["acceleration"] ** 0.5, parts["jerk"] ** (1 / 3), 1.05)
     solver: Solver = "torque" if findings["solver"] == "crocoddyl" else "mink"
+    usual_kg = joints.header.get("contents_kg")
+    touched = freed_of(findings["collisions"]) if _only_touches(findings, problems) else set()
 
     def works(changed: Reference, contents_kg: float | None) -> bool:
-        made = retarget(changed, contents_kg=contents_kg, strict=False, solver=solver)
+        made = joints
+        if contents_kg != usual_kg or not np.array_equal(changed.T_world_object, reference.T_world_object):
+            made = retarget(changed, contents_kg=contents_kg, strict=False, solver=solver)
         return not _findings(changed, made)[1]
 
-    return nearest_variant(reference, joints.header.get("contents_kg"), findings["payload_kg"], slower, works)
+    return nearest_variant(reference, usual_kg, findings["payload_kg"], slower, touched, works)
 
 
 def _words(findings: dict[str, Any], problems: list[str], variant: list[str]) -> list[str]:

@@ -243,7 +243,8 @@ def with_receptacle_moved(reference: Reference, along_m: float, across_m: float)
     if along_m == across_m == 0.0:
         return reference
     lean: Array = reference.T_world_object[reference.pour_index, :2, 2]
-    along = lean / max(float(np.linalg.norm(lean)), 1e-9)
+    size = float(np.linalg.norm(lean))
+    along = lean / size if size > 1e-6 else np.array([1.0, 0.0])
     T = reference.T_world_receptacle.copy()
     T[:2, 3] += along_m * along + across_m * np.array([-along[1], along[0]])
     return reference.with_header(receptacle={**reference.header["receptacle"], "T_world_receptacle": T.tolist()})

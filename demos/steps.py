@@ -40,7 +40,8 @@ def reference_stage(
 ) -> Stage:
     """NAME.track.npz (and the receptacle's) -> NAME.reference.npz. receptacle: a library vessel to stand there.
 
-    scale: "auto" takes what pours best in the simulator, if the faithful motion does not pour well.
+    scale: "auto" gives way to a touch of table or receptacle (`without_contact`), then takes what pours best in the
+        simulator, if the faithful motion does not pour well; a number changes nothing but the size.
     speed: of the motion over the video's. elevation_deg: how far the camera looks down, where nothing upright tells.
     """
     output = reference_path(track, folder)
@@ -49,6 +50,7 @@ def reference_stage(
         from ..envs.placement import build_reference
         from ..extract.track import ObjectTrack
         from ..extract.vessels import make_vessel, resolve_category
+        from .feasibility import without_contact
         from .scale_search import search_scale
 
         vessel = make_vessel(resolve_category(receptacle)[0]) if receptacle else None
@@ -59,9 +61,10 @@ def reference_stage(
             chosen: dict[str, Any] = {"scale": wanted, "speed": speed, "elevation_deg": elevation_deg, "seed": seed}
             return build_reference(moved, seen, receptacle=vessel, **chosen)
 
-        reference = build(scale)
         if scale == "auto":
-            reference = search_scale(reference, build, progress)
+            reference = search_scale(without_contact(build(scale)), lambda s: without_contact(build(s)), progress)
+        else:
+            reference = build(scale)
         reference.save(output)
         return {
             "knots": len(reference),

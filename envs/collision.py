@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from ..extract.geometry import Array
 from .kinematics import HAND_BODY
 from .panda import FINGER_MAX_M, panda_spec
-from .receptacle import mouth_radius_m
+from .receptacle import mouth_radius_m, mouth_xy_m
 
 if TYPE_CHECKING:
     from ..extract.vessels import Vessel
@@ -65,7 +65,8 @@ class CollisionChecker:
         if receptacle is not None and T_receptacle is not None:
             radius, height = float(receptacle.exterior.radius_m.max()), float(receptacle.extents_m[2])
             radius = max(radius, mouth_radius_m(receptacle))
-            stand = spec.worldbody.add_body(name="receptacle", pos=T_receptacle[:3, 3])
+            place_m = [*mouth_xy_m(receptacle, T_receptacle), T_receptacle[2, 3]]
+            stand = spec.worldbody.add_body(name="receptacle", pos=place_m)
             stand.add_geom(
                 type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=[radius, height / 2, 0], contype=_FIXED, conaffinity=0
             )

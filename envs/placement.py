@@ -18,7 +18,7 @@ from ..extract.track import ObjectTrack
 from .grasps import MAX_WIDTH_M
 from .jet import filling_m3, jet_of, tilt_rad
 from .placement_search import Placement, Shortfall, Stage, search_placement
-from .receptacle import bottom_m, place_receptacle, receptacle_pose_at_pour, surface_points
+from .receptacle import bottom_m, mouth_xy_m, place_receptacle, receptacle_pose_at_pour, surface_points
 from .reference import Reference, vessel_from_header, vessel_to_header
 from .resampling import ResampledTrack, resample_track
 from .retiming import at_speed, slowed
@@ -318,7 +318,7 @@ def _along_ray(tracked: Array, T: Array, vessel: Vessel, receptacle: Vessel, con
     landing = jet.share @ jet.landing_m(float(tracked[2, 3]) + bottom_m(receptacle))
     position = tracked[:3, 3]
     flat = position[:2]
-    factor = float(landing @ flat) / max(float(flat @ flat), 1e-9)
+    factor = float((landing - (mouth_xy_m(receptacle, tracked) - flat)) @ flat) / max(float(flat @ flat), 1e-9)
     # Far outside this range the track is wrong, not just its depth.
     return make_pose(tracked[:3, :3], position * float(np.clip(factor, 0.5, 2.0)))
 

@@ -37,6 +37,14 @@ def mouth_radius_m(receptacle: Vessel) -> float:
     return float(receptacle.interior.radius_m[-1]) * min(1.0, receptacle.interior.aspect)
 
 
+def mouth_xy_m(receptacle: Vessel, T: Array) -> Array:
+    """(2,) where the middle of the opening is for an upright pose (4, 4).
+
+    It is not the origin, the middle of the bounding box, of what has a handle.
+    """
+    return np.asarray(T[:2, 3] + T[:2, :2] @ np.asarray(receptacle.interior.axis_xy_m))
+
+
 def bottom_m(vessel: Vessel) -> float:
     """Height of the origin above the underside (the origin is the centre of the bounding box)."""
     return 0.5 * float(vessel.extents_m[2])
@@ -66,23 +74,26 @@ def place_receptacle(
     outer = float(receptacle.exterior.radius_m.max()) * max(1.0, receptacle.exterior.aspect) + 0.005
     jet = jet_of(T, vessel, filling_m3(vessel, receptacle), control_hz)
     low_xyz = _low_points(T, surface_points(vessel), rim_m)
+    # Found is where the mouth is to be; body and handle stand about it as they are turned.
+    R = _yaw_matrix(_facing_yaw_rad(T, tracked))
+    seen_xy_m = None if tracked is None else mouth_xy_m(receptacle, make_pose(R, tracked[:3, 3]))
     lift_m, caught = 0.0, 0.0
     centre: Array = np.zeros(2)
     # The landing point depends on the height of fall, that on where the receptacle stands: three rounds settle it.
     for _ in range(3):
         landing = jet.landing_m(rim_m - lift_m)
         centre = _best_centre(landing, jet.share, mouth, low_xyz, outer)
-        if tracked is not None:
-            centre = _least_move(tracked[:2, 3], centre, landing, jet.share, mouth)
+        if seen_xy_m is not None:
+            centre = _least_move(seen_xy_m, centre, landing, jet.share, mouth)
         caught = float(jet.share @ (np.linalg.norm(landing - centre, axis=1) <= 0.9 * mouth))
         needed = float(_needed_lift_m(low_xyz, centre[None], outer)[0])
         if abs(needed - lift_m) < 1e-4:
             break
         lift_m = needed
-    yaw_rad = _facing_yaw_rad(T, tracked)
-    T_receptacle = make_pose(_yaw_matrix(yaw_rad), (float(centre[0]), float(centre[1]), bottom_m(receptacle)))
-    if tracked is not None:
-        notes.append(_shift_sentence(centre - tracked[:2, 3], ray))
+    x, y = centre - mouth_xy_m(receptacle, make_pose(R))
+    T_receptacle = make_pose(R, (float(x), float(y), bottom_m(receptacle)))
+    if seen_xy_m is not None:
+        notes.append(_shift_sentence(centre - seen_xy_m, ray))
     if caught < 0.7:
         notes.append(
             f"The jet wanders while pouring: the receptacle can catch about {100 * caught:.0f}% of it where it stands."

@@ -5,10 +5,11 @@ import json
 
 import numpy as np
 import pytest
-from vid2demo.demos.feasibility import feasibility
+from vid2demo.demos.feasibility import feasibility, without_contact
 from vid2demo.demos.joints import JointTrajectory
 from vid2demo.demos.retarget import retarget
 from vid2demo.envs.builtin import builtin_reference
+from vid2demo.envs.clearance import overlaps_m
 from vid2demo.envs.kinematics import configuration_near, panda_chain
 from vid2demo.envs.panda import DQ_MAX_RAD_S, Q_HOME_RAD, Q_MAX_RAD, TAU_MAX_NM
 from vid2demo.envs.reference import Reference, minimum_jerk, vessel_to_header
@@ -114,6 +115,51 @@ def test_collisions_make_it_infeasible_and_carried_higher_it_can() -> None:
     assert variant["words"] == "Carried 2 cm higher, it can."
     assert variant["distance_m"] == {"mean": pytest.approx(0.02), "max": pytest.approx(0.02)}
     assert feasibility(*lowered(0.01))["feasible"] is True
+
+
+def test_a_small_touch_of_the_table_is_given_way_to_and_told() -> None:
+    reference, _ = lowered(-0.004)
+    freed = without_contact(reference)
+    np.testing.assert_allclose(freed.T_world_object[:, :3, 3] - reference.T_world_object[:, :3, 3], [[0, 0, 0.01]] * 51)
+    found = feasibility(freed, retarget(freed))
+    assert found["feasible"] is True
+    contact = found["changed"]["contact"]
+    assert (contact["raised_m"], contact["receptacle_moved_m"]) == (0.01, 0.0)
+    (touch,) = contact["freed_of"]
+    assert touch["depth_m"] == pytest.approx(0.004, abs=1e-3)
+    told = next(words for words in found["words"] if "raised by 1 cm" in words)
+    assert "would touch the" in told
+    assert "(4 mm deep at 1.0 s)" in told
+    # Nothing is done where nothing is wrong, nor where it takes more than a little.
+    for bottom_m in (0.01, -0.07):
+        kept = lowered(bottom_m)[0]
+        assert without_contact(kept) is kept
+
+
+def test_a_receptacle_that_is_touched_from_the_side_is_moved_aside() -> None:
+    reference, _ = lowered(0.03)
+    bowl, mug = make_vessel("bowl"), make_vessel("mug")
+    lowest = reference.T_world_object[25]
+
+    def beside(aside_m: float) -> Array:
+        return make_pose(None, (lowest[0, 3], lowest[1, 3] + aside_m, 0.5 * bowl.extents_m[2]))
+
+    near_m, far_m = 0.05, 0.25
+    while far_m - near_m > 2e-4:
+        middle_m = 0.5 * (near_m + far_m)
+        deep = overlaps_m(mug, bowl, lowest[None], beside(middle_m))[0] > 0.004
+        near_m, far_m = (middle_m, far_m) if deep else (near_m, middle_m)
+    T = beside(near_m)
+    touching = reference.with_header(receptacle={**vessel_to_header(bowl), "T_world_receptacle": T.tolist()})
+    freed = without_contact(touching)
+    contact = freed.header["changed"]["contact"]
+    assert contact["freed_of"][0]["depth_m"] == pytest.approx(0.004, abs=1e-3)
+    assert contact["receptacle_moved_m"] == pytest.approx(0.01)
+    np.testing.assert_allclose(freed.T_world_receptacle[:3, 3] - T[:3, 3], [0.0, 0.01, 0.0], atol=1e-9)
+    np.testing.assert_array_equal(freed.T_world_object, reference.T_world_object)
+    assert "the receptacle was moved by 1 cm" in freed.notes[-1]
+    assert overlaps_m(mug, bowl, lowest[None], freed.T_world_receptacle)[0] <= 0.002
+    assert feasibility(freed, retarget(freed))["feasible"] is True
 
 
 def test_a_vessel_that_meets_the_receptacle_on_its_way_is_told() -> None:

@@ -13,7 +13,7 @@ from vid2demo.envs.collision import CollisionChecker
 from vid2demo.envs.jet import filling_m3, jet_of
 from vid2demo.envs.kinematics import limit_margin_rad, panda_chain
 from vid2demo.envs.placement import build_reference, camera_elevation_deg, camera_rotation, without_spin
-from vid2demo.envs.receptacle import mouth_radius_m, surface_points
+from vid2demo.envs.receptacle import mouth_radius_m, mouth_xy_m, surface_points
 from vid2demo.envs.reference import Reference, minimum_jerk, vessel_to_header
 from vid2demo.envs.resampling import resample_track
 from vid2demo.extract.errors import UserError
@@ -127,14 +127,25 @@ def test_what_is_poured_lands_in_the_receptacle_and_its_rim_stays_clear(placed: 
     assert T_mug[2, 3] == pytest.approx(0.5 * mug.extents_m[2])
     rim_m = float(mug.extents_m[2])
     jet = jet_of(reference.T_world_object, KETTLE, filling_m3(KETTLE, mug), reference.control_hz)
-    away = np.linalg.norm(jet.landing_m(rim_m) - T_mug[:2, 3], axis=1)
+    middle = mouth_xy_m(mug, T_mug)
+    away = np.linalg.norm(jet.landing_m(rim_m) - middle, axis=1)
     assert jet.poured > 0.5
     assert jet.share @ (away < 0.9 * mouth_radius_m(mug)) > 0.95
     points = surface_points(KETTLE)
     for T in reference.T_world_object:
         world = points @ T[:3, :3].T + T[:3, 3]
-        over = np.linalg.norm(world[:, :2] - T_mug[:2, 3], axis=1) < float(mug.exterior.radius_m.max())
+        over = np.linalg.norm(world[:, :2] - middle, axis=1) < float(mug.exterior.radius_m.max())
         assert not over.any() or world[over, 2].min() > rim_m + 0.009
+
+
+def test_the_mouth_of_what_has_a_handle_is_in_the_middle_of_its_rim() -> None:
+    mug = make_vessel("mug")
+    T = make_pose(Rotation.from_euler("z", 1.0).as_matrix(), (0.4, 0.1, 0.5 * mug.extents_m[2]))
+    world = np.asarray(mug.mesh.vertices) @ T[:3, :3].T + T[:3, 3]
+    rim = world[world[:, 2] > world[:, 2].max() - 1e-4, :2]
+    middle = mouth_xy_m(mug, T)
+    np.testing.assert_allclose(middle, 0.5 * (rim.min(axis=0) + rim.max(axis=0)), atol=1e-3)
+    assert np.linalg.norm(middle - T[:2, 3]) > 0.01
 
 
 def test_start_configuration_and_grasp_belong_together(placed: tuple[ObjectTrack, Reference]) -> None:
