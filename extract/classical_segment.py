@@ -1,7 +1,4 @@
-"""Objects in a picture and through a video without learned models: what differs in colour from the border, and flow.
-
-Good for things that stand apart on a table. Things that touch come out as one; boxes by hand or a network part them.
-"""
+"""Objects in a picture and through a video without learned models: regions with clear outlines, GrabCut, and flow."""
 
 from __future__ import annotations
 
@@ -11,47 +8,31 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
 
 from .protocols import Box, Image, Mask, Proposal
+from .region_tree import likely_regions
 from .segment import mask_box, mask_from_box, mask_from_silhouette
 
-BORDER, SMALLEST, LARGEST = 0.04, 0.001, 0.5  # of a side; of the picture's area
-BINS, RARE = 24, 0.9  # of Lab's axes; share of the pixels of a colour, evened out for area, that lie inside
 WORK_SIDE_PX = 640
+MOST = 10  # proposals of a picture
 RECUT_EVERY, RECUT_BAND_PX = 3, 5
-GAP_PX = 3  # between parts of one object, such as where a thin handle was lost
 
 
 @dataclass(frozen=True)
 class ClassicalSegmenter:
     """`Segmenter` by GrabCut and dense optical flow."""
 
-    name: str = "classical-1"
+    name: str = "classical-2"
 
     def propose(self, rgb: Image, prompt: str = "objects.") -> list[Proposal]:
-        """Blobs that the colours of the picture's border do not explain, largest first; the prompt is not read.
-
-        score: the share of a blob's convex hull that it fills, for shadows and leftovers are ragged.
-        """
+        """The regions of `region_tree` that are likeliest objects, likeliest first; the prompt is not read."""
         height, width = rgb.shape[:2]
         scale = min(1.0, WORK_SIDE_PX / max(height, width))
         small = np.asarray(cv2.resize(rgb, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
-        if min(small.shape[:2]) < 16:
-            return []
-        unlike = _unlike_border(small)
-        if unlike.any():
-            unlike = mask_from_silhouette(small, unlike, RECUT_BAND_PX)
-        blobs = cv2.morphologyEx(unlike.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((GAP_PX, GAP_PX), np.uint8))
-        _, parts, stats, _ = cv2.connectedComponentsWithStats(blobs)
-        areas = stats[:, cv2.CC_STAT_AREA] / blobs.size
         found = []
-        for part in 1 + np.argsort(-areas[1:], kind="stable"):
-            if not SMALLEST < areas[part] < LARGEST:
-                continue
-            mask = np.asarray(parts == part)
-            whole = cv2.resize(mask.astype(np.uint8), (width, height), interpolation=cv2.INTER_LINEAR) > 0
-            found.append(Proposal(np.asarray(whole), mask_box(whole), _solidity(mask)))
+        for region in likely_regions(small, MOST):
+            whole = cv2.resize(region.mask.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR) > 0.5
+            found.append(Proposal(np.asarray(whole), mask_box(whole), region.score))
         return found
 
     def segment(self, rgb: Image, boxes_xywh_px: Sequence[Box]) -> list[Mask]:
@@ -74,24 +55,3 @@ class ClassicalSegmenter:
                 current = np.stack(moved)
             before = grey
             yield current.copy()
-
-
-def _unlike_border(rgb: Image) -> Mask:
-    """(H, W) what has colours that are RARE in the picture's border, by smoothed histograms, without specks."""
-    lab = cv2.cvtColor(rgb, cv2.COLOR_RGB2LAB)
-    edge = min(max(2, round(BORDER * max(rgb.shape[:2]))), min(rgb.shape[:2]) // 4)
-    inside = np.zeros(rgb.shape[:2], np.uint8)
-    inside[edge:-edge, edge:-edge] = 1
-    shares = []
-    for part in (inside, 1 - inside):
-        counts = cv2.calcHist([lab], [0, 1, 2], part, [BINS] * 3, [0.0, 256.0] * 3)
-        shares.append(gaussian_filter(counts, 0.7) / int(part.sum()))
-    cell = tuple((lab * (BINS / 256)).astype(int).transpose(2, 0, 1))
-    rare = (shares[0] / (shares[0] + shares[1] + 1e-9))[cell] > RARE
-    return np.asarray(cv2.medianBlur(rare.astype(np.uint8) & inside, 3) > 0)
-
-
-def _solidity(mask: Mask) -> float:
-    contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    hull = cv2.contourArea(cv2.convexHull(np.concatenate(contours)))
-    return float(min(np.count_nonzero(mask) / max(hull, 1.0), 1.0))

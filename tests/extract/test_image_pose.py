@@ -117,14 +117,13 @@ def test_a_person_s_word_selects_the_size(root: Path) -> None:
     assert poser.size_of(large, "wardrobe")[0] > 1.0
 
 
-def test_blobs_on_a_plain_table_are_found(scene) -> None:  # type: ignore[no-untyped-def]
+def test_things_on_a_plain_table_are_found(scene) -> None:  # type: ignore[no-untyped-def]
     rgb, masks, _ = scene
     segmenter = ClassicalSegmenter()
     assert isinstance(segmenter, Segmenter)
     proposals = segmenter.propose(rgb)
-    assert 2 <= len(proposals) <= 3  # the pan's handle may come out by itself: it is thin where it begins
-    for mask in masks.values():
-        assert max(iou(p.mask, mask) for p in proposals) > 0.8
+    for mask in masks.values():  # what comes after them are parts of theirs, or of the table
+        assert max(iou(p.mask, mask) for p in proposals[:3]) > 0.8
     boxes = [mask_box(mask) for mask in masks.values()]
     assert min(iou(cut, mask) for cut, mask in zip(segmenter.segment(rgb, boxes), masks.values(), strict=True)) > 0.8
     assert segmenter.propose(np.full((6, 6, 3), 90, np.uint8)) == []
