@@ -213,7 +213,8 @@ class CameraWatch:
         if H is None:
             return lost
         K = self.working_camera
-        R, share = fitted_rotation(key.start.astype(float), key.now.astype(float), K, inlier[:, 0] > 0)
+        R, off_px = fitted_rotation(key.start.astype(float), key.now.astype(float), K, inlier[:, 0] > 0)
+        share = float(np.mean(off_px < INLIER_PX))
         quality = float(np.mean(inlier))
         if share >= TURN_SHARE * quality:
             # Three numbers instead of eight: a homography's perspective is mostly noise when the camera only turns.
@@ -224,7 +225,8 @@ class CameraWatch:
     def _renew(self, H: Array, R: Array, image: Image, background: Image, *, followed: bool) -> None:
         """Make the present frame the key frame: the corners that were followed to it, and new ones away from them."""
         spacing = max(4.0, 0.012 * max(image.shape))
-        ids, kept = np.zeros(0, np.int32), np.zeros((0, 2), np.float32)
+        ids: NDArray[np.int32] = np.zeros(0, np.int32)
+        kept: NDArray[np.float32] = np.zeros((0, 2), np.float32)
         if followed and self._key is not None:
             ids, kept = self._key.ids, self._key.now
         free = background.copy()
@@ -278,8 +280,13 @@ def _moved(H: Array, pixels: Array) -> Array:
     return np.asarray(uvw[:, :2] / uvw[:, 2:])
 
 
-def fitted_rotation(start: Array, now: Array, K: Array, inlier: NDArray[np.bool_]) -> tuple[Array, float]:
-    """Rotation between two views (M, 2) px of far points, robust, and the share of points that agree with it."""
+def fitted_rotation(
+    start: Array, now: Array, K: Array, inlier: NDArray[np.bool_], bound_px: float = INLIER_PX
+) -> tuple[Array, Array]:
+    """Rotation between two views (M, 2) px of far points, robust, and (M,) how far off in px it leaves each point.
+
+    inlier: those to begin with.  bound_px: off by more, a point counts little.
+    """
     rays = [np.column_stack([p, np.ones(len(p))]) @ np.linalg.inv(K).T for p in (start, now)]
     a, b = (r / np.linalg.norm(r, axis=1, keepdims=True) for r in rays)
     weight, off_px = inlier.astype(float), np.zeros(len(start))
@@ -288,5 +295,5 @@ def fitted_rotation(start: Array, now: Array, K: Array, inlier: NDArray[np.bool_
         U, _, Vt = np.linalg.svd((b * weight[:, None]).T @ a)
         R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
         off_px = np.linalg.norm(_moved(K @ R @ np.linalg.inv(K), start) - now, axis=1)
-        weight = 1.0 / (1.0 + (off_px / INLIER_PX) ** 2) ** 2
-    return R, float(np.mean(off_px < INLIER_PX))
+        weight = 1.0 / (1.0 + (off_px / bound_px) ** 2) ** 2
+    return R, off_px

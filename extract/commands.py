@@ -162,6 +162,9 @@ class Synthesize(Staged):
     size: Annotated[tuple[int, int], arg(metavar="W H", help="Size of the picture [px], even numbers.")] = (640, 480)
     without_hand: Annotated[bool, told(None, "Leave out the hand that hides a part of the vessel.")] = False
     depth: Annotated[bool, told(None, "Write a depth camera's pictures as well: depth/*.png, in mm.")] = False
+    camera_path: Annotated[
+        Literal["still", "turn", "walk"], arg(help="Stand, turn in place, or be carried around the table.")
+    ] = "still"
     seed: Seed = 0
 
     def do(self) -> Result:
@@ -170,6 +173,7 @@ class Synthesize(Staged):
         settings = {"category": self.category, "receptacle": self.receptacle, "seed": self.seed, "size": self.size}
         settings |= {"seconds": self.seconds, "fps": self.fps, "occluder": not self.without_hand}
         settings |= {"depth": True} if self.depth else {}
+        settings |= {"camera_path": self.camera_path} if self.camera_path != "still" else {}
         return self.do_stages([synthesize_stage(self.out, settings)], settings)
 
 

@@ -23,12 +23,17 @@ MODEL_POINTS = 1000
 
 @dataclass(frozen=True)
 class Comparison:
-    """frames: compared ones; velocity: the paper's errors by protocol; pose: errors of single poses."""
+    """frames: compared ones; velocity: the paper's errors by protocol; pose: errors of single poses.
+
+    first_camera: the same of poses in the first frame's camera, the errors of the camera's motion among them; None
+        where the truth does not tell how its camera moved.
+    """
 
     frames: int
     visible_frames: int
     velocity: dict[str, VelocityErrors]
     pose: PoseErrors
+    first_camera: PoseErrors | None = None
 
     def to_json(self) -> dict[str, Any]:
         return asdict(self)
@@ -36,7 +41,14 @@ class Comparison:
     @staticmethod
     def from_json(value: Mapping[str, Any]) -> Comparison:
         velocity = {name: VelocityErrors(**errors) for name, errors in value["velocity"].items()}
-        return Comparison(value["frames"], value["visible_frames"], velocity, PoseErrors(**value["pose"]))
+        first = value.get("first_camera")
+        return Comparison(
+            value["frames"],
+            value["visible_frames"],
+            velocity,
+            PoseErrors(**value["pose"]),
+            None if first is None else PoseErrors(**first),
+        )
 
     def table(self) -> str:
         """The same for a reader."""
@@ -46,16 +58,19 @@ class Comparison:
         )
         for name, errors in self.velocity.items():
             lines.append(f"{name:<10}{errors.e_rot:>10.4f}{errors.e_proj:>10.4f}{errors.e_depth:>10.4f}")
-        lines.append("")
-        for name, value in self.pose.to_json().items():
-            if value is not None:
-                lines.append(f"{name:<22}{value:>10.4g}")
+        lines += ["", *_figures(self.pose)]
+        if self.first_camera is not None:
+            lines += ["", "in the first frame's camera:", *_figures(self.first_camera)]
         return "\n".join(lines)
+
+
+def _figures(errors: PoseErrors) -> list[str]:
+    return [f"{name:<22}{value:>10.4g}" for name, value in errors.to_json().items() if value is not None]
 
 
 @dataclass(frozen=True)
 class Truth:
-    """Poses (N, 4, 4), camera (3, 3) px and times (N,) s, and what a track's header adds."""
+    """Poses (N, 4, 4), camera (3, 3) px and times (N,) s; where its camera was, and what a track's header adds."""
 
     T_camera_object: Array
     camera_matrix: Array
@@ -63,10 +78,13 @@ class Truth:
     symmetry: Symmetry | None = None
     extent_m: float | None = None
     mesh_sha256: str | None = None
+    T_first_camera: Array | None = None
 
 
 def load_truth(path: Path) -> Truth:
     """Truth from an `*.track.npz`, or from a plain npz with T_camera_object, camera_matrix and time_s.
+
+    Of a moving camera a plain npz may hold T_first_camera (N, 4, 4) as well.
 
     Raises UserError when the file is missing, damaged, or lacks one of them.
     """
@@ -75,7 +93,11 @@ def load_truth(path: Path) -> Truth:
     try:
         with np.load(path, allow_pickle=False) as archive:
             names = set(archive.files)
-            arrays = {name: np.asarray(archive[name], np.float64) for name in _TRUTH_ARRAYS if name in names}
+            arrays = {
+                name: np.asarray(archive[name], np.float64)
+                for name in (*_TRUTH_ARRAYS, "T_first_camera")
+                if name in names
+            }
     except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
         # What NumPy says of such files is how to load them unsafely.
         raise UserError(f"{path} cannot be read as a truth: damaged or no npz; give a track or a plain npz") from error
@@ -94,13 +116,17 @@ def load_truth(path: Path) -> Truth:
             track.symmetry if "symmetry" in mesh else None,
             float(max(extents)) if extents else None,
             mesh.get("sha256"),
+            track.T_first_camera,
         )
-    T, camera, time_s = (arrays[name] for name in _TRUTH_ARRAYS)
+    T, camera, time_s = (arrays.pop(name) for name in _TRUTH_ARRAYS)
+    T_first_camera = arrays.get("T_first_camera")
     if T.shape != (len(time_s), 4, 4) or camera.shape != (3, 3):
         raise UserError(f"{path} has poses {T.shape}, times {time_s.shape} and camera {camera.shape}; they do not fit")
-    if not all(np.all(np.isfinite(array)) for array in (T, camera, time_s)):
+    if T_first_camera is not None and T_first_camera.shape != T.shape:
+        raise UserError(f"{path} has poses {T.shape} and T_first_camera {T_first_camera.shape}; they do not fit")
+    if not all(np.all(np.isfinite(array)) for array in (T, camera, time_s, *arrays.values())):
         raise UserError(f"{path} holds values that are not finite; write the truth again")
-    return Truth(T, camera, time_s)
+    return Truth(T, camera, time_s, T_first_camera=T_first_camera)
 
 
 def matched_frames(estimate_s: Array, truth_s: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -158,13 +184,19 @@ def compare_tracks(
     points = None
     if model is not None and one_frame and "library" not in mesh:
         points = model.vertices[np.random.default_rng(seed).permutation(len(model.vertices))[:MODEL_POINTS]]
+    points_m = None if points is None else np.asarray(points, np.float64)
     T, T_truth = estimate.T_camera_object[at], truth.T_camera_object[of]
+    first_camera = None
+    if truth.T_first_camera is not None:
+        T_first, T_first_truth = estimate.from_first_camera().T_camera_object[at], truth.T_first_camera[of] @ T_truth
+        first_camera = pose_errors(T_first, T_first_truth, **shared, points_m=points_m)
     scales = {"scale_estimate_m": scale_m, "scale_truth_m": true_extent_m or scale_m}
     return Comparison(
         len(at),
         int(np.count_nonzero(estimate.visible[at])),
         {name: velocity_errors(T, T_truth, protocol=name, **shared, **scales) for name in PROTOCOLS},  # type: ignore[arg-type]
-        pose_errors(T, T_truth, **shared, points_m=None if points is None else np.asarray(points, np.float64)),
+        pose_errors(T, T_truth, **shared, points_m=points_m),
+        first_camera,
     )
 
 

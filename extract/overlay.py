@@ -8,8 +8,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from .geometry import Array, project, scaled_camera, transform_points
+from .geometry import Array, invert_pose, project, scaled_camera, transform_points
 from .raster import render_depth
 from .region import TrackingMesh
 from .track import ObjectTrack
@@ -54,7 +55,7 @@ def draw_track(image: Image, item: OverlayItem, index: int, scale: float, colour
         cv2.drawContours(image, contours, -1, colour, 2, cv2.LINE_AA)
         _draw_axes(image, T, K, 0.6 * item.mesh.radius_m)
     past = (track.time_s <= track.time_s[index]) & (track.time_s > track.time_s[index] - TRAIL_S) & track.visible
-    trail = project(K, track.T_camera_object[past, :3, 3])
+    trail = project(K, where_it_was(track, past, index))
     if len(trail) > 1:
         cv2.polylines(image, [np.round(trail).astype(np.int32)], False, colour, 2, cv2.LINE_AA)
     state = f"{track.confidence[index]:.0%}" if visible else "not in view"
@@ -64,6 +65,15 @@ def draw_track(image: Image, item: OverlayItem, index: int, scale: float, colour
         cv2.putText(
             image, f"{track.name} {state}", (x, y), cv2.FONT_HERSHEY_SIMPLEX, 0.5, shade, thickness, cv2.LINE_AA
         )
+
+
+def where_it_was(track: ObjectTrack, past: NDArray[np.bool_], index: int) -> Array:
+    """(M, 3) places of the object in past frames, in the camera of this one, before which they lie."""
+    if track.T_first_camera is None:
+        return np.asarray(track.T_camera_object[past, :3, 3])
+    first = track.from_first_camera().T_camera_object[past, :3, 3]
+    here = transform_points(invert_pose(track.T_first_camera[index]), first)
+    return np.asarray(here[here[:, 2] > 1e-3])
 
 
 def _draw_axes(image: Image, T: Array, K: Array, length_m: float) -> None:

@@ -1,4 +1,7 @@
-"""Tracks as a recording for the Rerun viewer: the camera with its pictures, the meshes as they move, confidence."""
+"""Tracks as a recording for the Rerun viewer: the camera with its pictures, the meshes as they move, confidence.
+
+The world is the first frame's camera; one that moves takes its pictures and the objects in them along.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,7 @@ from typing import Any
 
 from .errors import UserError
 from .files import atomic_path
-from .geometry import scaled_camera
+from .geometry import Array, scaled_camera
 from .overlay import OverlayItem
 from .video import iterate_frames
 
@@ -36,12 +39,16 @@ def write_rerun(video: Path, items: Sequence[OverlayItem], out: Path) -> None:
             place = f"camera/{item.track.name}"
             mesh = rr.Mesh3D(vertex_positions=item.mesh.vertices_m, triangle_indices=item.mesh.faces)
             recording.log(f"{place}/mesh", mesh, static=True)
-            path = item.track.T_camera_object[item.track.visible, :3, 3]
+            path = item.track.from_first_camera().T_camera_object[item.track.visible, :3, 3]
             recording.log(f"path/{item.track.name}", rr.LineStrips3D([path]), static=True)
+        if track.T_first_camera is not None:
+            recording.log("path/camera", rr.LineStrips3D([track.T_first_camera[:, :3, 3]]), static=True)
         for frame in iterate_frames(video, PICTURE_SIDE_PX):
             if frame.index >= len(track):
                 break
             recording.set_time("video", duration=frame.time_s)
+            if track.T_first_camera is not None:
+                recording.log("camera", _transform(rr, track.T_first_camera[frame.index]))
             height, width = frame.rgb.shape[:2]
             scale = width / track.header["image_size_px"][0]
             camera = scaled_camera(track.camera_matrix, scale)
@@ -51,8 +58,12 @@ def write_rerun(video: Path, items: Sequence[OverlayItem], out: Path) -> None:
             for item in items:
                 T = item.track.T_camera_object[frame.index]
                 place = f"camera/{item.track.name}"
-                recording.log(place, rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]))
+                recording.log(place, _transform(rr, T))
                 confidence = float(item.track.confidence[frame.index])
                 recording.log(f"confidence/{item.track.name}", rr.Scalars(confidence))
         recording.flush()
         recording.disconnect()
+
+
+def _transform(rr: Any, T: Array) -> Any:
+    return rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3])

@@ -7,8 +7,9 @@ import cv2
 import numpy as np
 import pytest
 from vid2demo.extract.errors import UserError
-from vid2demo.extract.geometry import invert_pose, project, transform_points
+from vid2demo.extract.geometry import invert_pose, project, rotation_angle_rad, transform_points
 from vid2demo.extract.synthetic import SyntheticClip, synthesize
+from vid2demo.extract.synthetic_camera import CameraPath, move_camera
 from vid2demo.extract.synthetic_hand import grips
 from vid2demo.extract.synthetic_motion import PourPath, PourShape, minimum_jerk, place_camera, plan_pour
 from vid2demo.extract.synthetic_scene import HAND, OBJECT, Scene
@@ -56,14 +57,16 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> SyntheticClip:
     return synthesize("mug", 3, tmp_path_factory.mktemp("clip"), receptacle="mug", **SMALL)
 
 
-@pytest.mark.parametrize(("category", "seed"), [("mug", 0), ("gooseneck_kettle", 1)])
-def test_projected_truth_coincides_with_the_render(category: str, seed: int) -> None:
+@pytest.mark.parametrize(
+    ("category", "seed", "kind"), [("mug", 0, "still"), ("gooseneck_kettle", 1, "still"), ("mug", 2, "walk")]
+)
+def test_projected_truth_coincides_with_the_render(category: str, seed: int, kind: CameraPath) -> None:
     vessel, receptacle, shape, path = planned(category, seed)
     rng = np.random.default_rng(seed)
     size = (640, 480)
-    camera, _ = place_camera(rng, path, shape, size)
-    T_camera_object = invert_pose(camera.T_world_camera) @ path.T_world_object
-    with Scene(rng, vessel, receptacle, path, camera, size, grip=None) as scene:
+    camera, T_world_camera = move_camera(rng, place_camera(rng, path, shape, size)[0], path, shape, size, kind)
+    T_camera_object = invert_pose(T_world_camera) @ path.T_world_object
+    with Scene(rng, vessel, receptacle, path, camera, size, None, T_world_camera) as scene:
         for k in (0, 90):
             rendered = scene.labels(k, only=OBJECT) == OBJECT
             drawn = silhouette(vessel, T_camera_object[k], camera.camera_matrix, size)
@@ -190,6 +193,37 @@ def test_hand_hides_a_part_and_can_be_left_out() -> None:
         assert not np.any(scene.labels(60) == HAND)
 
 
+@pytest.mark.parametrize("kind", ["turn", "walk"])
+def test_a_moving_camera_keeps_everything_in_view_and_tells_where_it_was(kind: CameraPath) -> None:
+    _, _, shape, path = planned("mug", 1)
+    size = (640, 480)
+    placed, _ = place_camera(np.random.default_rng(1), path, shape, size)
+    camera, T = move_camera(np.random.default_rng(0), placed, path, shape, size, kind)
+    assert np.array_equal(camera.T_world_camera, T[0])
+    for k in range(0, len(T), 10):
+        for pose, points in (
+            (path.T_world_object[k], shape.points_m),
+            (path.T_world_receptacle, shape.receptacle_points_m),
+        ):
+            pixels = project(camera.camera_matrix, transform_points(invert_pose(T[k]) @ pose, points))
+            assert np.all((pixels > 0) & (pixels < size))
+    step = np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1)
+    turned = rotation_angle_rad(T[0, :3, :3], T[:, :3, :3]).max()
+    assert step.max() < 0.03
+    assert np.deg2rad(4) < turned < np.deg2rad(60)
+    assert (step.sum() > 0.25) == (kind == "walk")
+    assert step.any() == (kind == "walk")
+
+
+def test_the_truth_of_a_walk_lets_the_receptacle_rest(tmp_path: Path) -> None:
+    clip = synthesize("mug", 3, tmp_path, receptacle="bowl", camera_path="walk", **{**SMALL, "seconds": 0.2})
+    track = ObjectTrack.load(clip.receptacle_path)
+    assert track.T_first_camera is not None
+    assert track.header["camera"]["motion"]["kind"] == "moving"
+    assert np.ptp(track.T_first_camera[:, :3, 3], axis=0).max() > 0.05
+    assert np.ptp(track.from_first_camera().T_camera_object, axis=0).max() < 1e-9
+
+
 def test_pictures_are_scenes_and_noise_is_noise(clip: SyntheticClip, tmp_path: Path) -> None:
     frame = next(iter(iterate_frames(clip.video))).rgb.astype(float)
     assert 40 < frame.mean() < 215
@@ -234,6 +268,7 @@ def test_minimum_jerk_starts_and_ends_at_rest() -> None:
         ({"seconds": float("nan")}, "seconds is nan"),
         ({"size": (161, 120)}, "size is 161x120"),
         ({"size": (16, 12)}, "between 64 and"),
+        ({"camera_path": "fly"}, "camera_path is 'fly'"),
     ],
 )
 def test_bad_input_is_one_sentence_and_leaves_nothing(arguments: dict[str, object], words: str, tmp_path: Path) -> None:
