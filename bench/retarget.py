@@ -6,8 +6,11 @@
 Everything starts from exact tracks of synthetic pours, which are rendered small once into --clips. `solve`: means over
 the pours of the plan's error to the true motion, where the track is exact and where a tracker trembles by 0.5 mm and
 0.2 degrees, of the largest torque beyond gravity's and of the largest jerk; `wins` counts the pours in which Eq. 4 is
-no worse than inverse kinematics in mean error, torque and jerk at once. `weights`: what the pull toward the track
-trades. `execute`: with what `--scale auto` chose, the controller's errors over the whole motion, and what was poured.
+no worse than inverse kinematics in mean error, torque and jerk at once, and `within 1%` those in which it is worse in
+none by more. On an exact track nothing is to be smoothed: its jerk is what there is, and followed 40 times closer than
+by inverse kinematics, whose lag of a few micrometres rounds it off, single pours have up to 5% more of it. `weights`:
+what the pull toward the track trades. `execute`: with what `--scale auto` chose, the controller's errors over the whole
+motion, and what was poured.
 `time`: one core's time for 250 knots, inverse kinematics included.
 """
 
@@ -123,9 +126,10 @@ def table_solve(made: list[dict[tuple[str, str], dict[str, float]]]) -> list[dic
     for track in TRACKS:
         plain, best = ([found[track, solver] for found in made] for solver in ("mink", "torque"))
         judged = ("mean_mm", "mean_deg", "torque_nm", "jerk_rad_s3")
-        wins = sum(all(b[name] <= p[name] for name in judged) for p, b in zip(plain, best, strict=True))
-        rows.append({"track": track, "solver": "mink alone", "wins": "", **mean_of(plain)})
-        rows.append({"track": track, "solver": "Eq. 4", "wins": f"{wins}/{len(made)}", **mean_of(best)})
+        worst = [max(b[name] / p[name] for name in judged) for p, b in zip(plain, best, strict=True)]
+        wins, nearly = (f"{sum(part <= most for part in worst)}/{len(made)}" for most in (1.0, 1.01))
+        rows.append({"track": track, "solver": "mink alone", "wins": "", "within 1%": "", **mean_of(plain)})
+        rows.append({"track": track, "solver": "Eq. 4", "wins": wins, "within 1%": nearly, **mean_of(best)})
     return rows
 
 

@@ -8,12 +8,12 @@ import numpy as np
 
 from ..envs.grasps import MAX_WIDTH_M
 from ..envs.kinematics import limit_margin_rad, manipulability, panda_chain
-from ..envs.panda import DQ_MAX_RAD_S, PAYLOAD_MAX_KG, TAU_MAX_NM
+from ..envs.panda import DQ_MAX_RAD_S, FLANGE_TO_TCP_M, PAYLOAD_MAX_KG, REACH_MAX_M, TAU_MAX_NM
 from ..extract.geometry import Array
 from .collisions import collisions_of, told
 from .dynamics import payload_of
 from .export import commands_of
-from .grip import grip_of
+from .grip import grip_of, slip_of
 from .limits import LIMITS, Extreme, commanded, extremes
 from .retarget import Solver, retarget, tracking_errors
 from .variants import Variant, freed_of, nearest_variant
@@ -33,17 +33,21 @@ def feasibility(reference: Reference, joints: JointTrajectory) -> dict[str, Any]
     """Findings (JSON-like) about a joint trajectory made for a reference on the same clock.
 
     `feasible`: tracking within 1 cm and 5 degrees, all limits of joints, gripper and payload kept, no collision.
-    `limits`: where the motion comes nearest to each limit at 1 kHz, and the margin that is left of it. `phases`: errors
-    before, in and after the pour. `collisions`: of arm, vessel, table and receptacle, looked for at every knot. `grip`:
-    what the fingers would have to bear by friction alone. `changed`: from the video, in numbers. `variant`: for what is
-    not feasible, the nearest motion found that is, and how far that is away; None if there is none. `scale_search`:
-    what `--scale auto` tried and what came of it. `words`: all of it in plain sentences. Raises ValueError when the two
+    `limits`: where the motion comes nearest to each limit at 1 kHz, and the margin that is left of it. `reach`: of the
+    flange from the shoulder. `phases`: errors before, in and after the pour. `collisions`: of arm, vessel, table and
+    receptacle, looked for at every knot. `grip`: what the fingers would have to bear by friction alone, and by how much
+    the vessel slips where that is too much. `changed`: from the video, in numbers. `variant`: for what is not feasible,
+    the nearest motion found that is, and how far that is away; None if there is none. `scale_search`: what
+    `--scale auto` tried and what came of it. `words`: all of it in plain sentences. Raises ValueError when the two
     differ in length.
     """
     findings, problems = _findings(reference, joints)
     findings["feasible"] = not problems
     variant = _variant(reference, joints, findings, problems) if problems else None
     findings["variant"] = variant and variant.told(reference)
+    if findings["grip"]["part"] > 1.0 and reference.has_receptacle and (slip := slip_of(reference, joints)):
+        findings["grip"] |= slip.told()
+        findings["grip"]["words"] += f" {slip.sentence()}"
     note = joints.header.get("solver", {}).get("note")
     said = [variant.words] if variant else []
     findings["words"] = [*_words(findings, problems, said), *([note] if note else []), *reference.notes]
@@ -77,7 +81,9 @@ def _findings(reference: Reference, joints: JointTrajectory) -> tuple[dict[str, 
     margin = limit_margin_rad(joints.q_rad)
     speed_part = np.abs(joints.dq_rad_s) / DQ_MAX_RAD_S
     torque_part = np.abs(joints.tau_nm) / TAU_MAX_NM
-    hand = panda_chain().hand(joints.q_rad)[:, :3, 3]
+    T_hand = panda_chain().hand(joints.q_rad)
+    hand = T_hand[:, :3, 3]
+    flange_m = np.linalg.norm(hand - FLANGE_TO_TCP_M * T_hand[:, :3, 2] - _SHOULDER, axis=1)
     commands = commands_of(joints)
     found = extremes(commanded(commands.q_rad, commands.tau_nm))
     nearest = {name: max((e for e in found if e.quantity == name), key=lambda e: e.part) for name in LIMITS}
@@ -93,7 +99,12 @@ def _findings(reference: Reference, joints: JointTrajectory) -> tuple[dict[str, 
         "speed_part_of_limit": _per_joint(speed_part, joints.time_s, smallest=False),
         "torque_part_of_limit": _per_joint(torque_part, joints.time_s, smallest=False),
         "limits": {name: _limit(extreme) for name, extreme in nearest.items()},
-        "reach_m": float(np.linalg.norm(hand - _SHOULDER, axis=1).max()),
+        "reach": {
+            "value_m": float(flange_m.max()),
+            "limit_m": REACH_MAX_M,
+            "margin_m": float(REACH_MAX_M - flange_m.max()),
+            "at_s": float(joints.time_s[int(flange_m.argmax())]),
+        },
         "manipulability": float(manipulability(joints.q_rad).min()),
         "lowest_hand_m": float(hand[:, 2].min()),
         "collisions": [told(reference, collision) for collision in collisions_of(reference, joints.q_rad)],
@@ -235,6 +246,7 @@ def _words(findings: dict[str, Any], problems: list[str], variant: list[str]) ->
     fastest = max(findings["speed_part_of_limit"], key=lambda entry: float(entry["value"]))
     strongest = max(findings["torque_part_of_limit"], key=lambda entry: float(entry["value"]))
     bend, jerk = (findings["limits"][name] for name in ("acceleration", "jerk"))
+    reach = findings["reach"]
     words = [
         verdict,
         *variant,
@@ -247,6 +259,8 @@ def _words(findings: dict[str, Any], problems: list[str], variant: list[str]) ->
         f"at {fastest['at_s']:.1f} s; joint {strongest['joint']} works hardest: "
         f"{100 * strongest['value']:.0f}% of its torque limit, with "
         f"{findings['payload_kg']:.2f} kg in the hand.",
+        f"The flange comes up to {100 * reach['value_m']:.0f} cm from the shoulder (at {reach['at_s']:.1f} s), of the "
+        f"{100 * reach['limit_m']:.1f} cm that the arm reaches.",
         f"At 1 kHz the largest acceleration is {100 * bend['part']:.0f}% of its limit (joint {bend['joint']}), the "
         f"largest jerk {100 * jerk['part']:.0f}% (joint {jerk['joint']}).",
     ]

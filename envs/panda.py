@@ -42,8 +42,11 @@ DTAU_MAX_NM_S = 1000.0
 PAYLOAD_MAX_KG = 3.0
 Q_HOME_RAD: Array = np.array([0.0, -0.785398, 0.0, -2.35619, 0.0, 1.5707, 0.785398])
 FINGER_MAX_M = 0.04
+# From the second joint's axis to the flange (datasheet: maximum reach 855 mm); the tcp lies further along its axis.
+REACH_MAX_M, FLANGE_TO_TCP_M = 0.855, 0.1034
 # What the Franka Hand can press with for as long as one likes, and at most (datasheet: continuous force 70 N, maximum
-# force 140 N); the stiffness of its servos here.
+# force 140 N, of which no duration is stated: a hold that needs it is reported as such); the stiffness of its servos
+# here.
 FINGER_MAX_N, FINGER_PEAK_N, FINGER_N_M = 70.0, 140.0, 1000.0
 
 # Stiffness and damping of the joint servos. Natural frequencies lie near 9 Hz at the shoulder and 14 Hz at the wrist

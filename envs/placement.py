@@ -18,7 +18,15 @@ from ..extract.track import ObjectTrack
 from .grasps import MAX_WIDTH_M
 from .jet import filling_m3, jet_of, tilt_rad
 from .placement_search import Placement, Shortfall, Stage, search_placement
-from .receptacle import bottom_m, mouth_xy_m, place_receptacle, receptacle_pose_at_pour, surface_points
+from .receptacle import (
+    ReceptaclePlacement,
+    bottom_m,
+    mouth_xy_m,
+    place_receptacle,
+    receptacle_pose_at_pour,
+    shift_sentence,
+    surface_points,
+)
 from .reference import Reference, vessel_from_header, vessel_to_header
 from .resampling import ResampledTrack, resample_track
 from .retiming import at_speed, slowed
@@ -83,14 +91,14 @@ def build_reference(
     notes = list(resampled.notes)
     seen = _upright(track, resampled, receptacle_track, held, elevation_deg, gravity_tolerance_deg, notes)
 
-    def stage_at(factor: float) -> tuple[Stage, list[str], float]:
+    def stage_at(factor: float) -> tuple[Stage, list[str], ReceptaclePlacement]:
         return _make_stage(seen, held, target, factor, control_hz)
 
     def attempt(factor: float, thorough: bool) -> Placement | Shortfall:
         return search_placement(stage_at(factor)[0], np.random.default_rng(seed), thorough=thorough)
 
     factor, placement = _choose_scale(attempt, scale)
-    stage, stage_notes, caught = stage_at(factor)
+    stage, stage_notes, placed = stage_at(factor)
     notes += stage_notes
     if factor != 1.0:
         why = "as asked" if scale != "auto" else "because the whole of it is out of the arm's reach"
@@ -122,6 +130,8 @@ def build_reference(
         "T_world_camera": T_world_camera.tolist(),
         "changed": {
             "leaps": [asdict(leap) for leap in resampled.leaps],
+            "lifted_over_rim_m": placed.lift_m,
+            "receptacle_moved_to_jet_m": float(np.linalg.norm(_moved_m(seen, placed))),
             # By how much gravity, where something upright told it, differs from the assumed elevation's.
             "camera_turned_rad": float(rotation_angle_rad(camera_rotation(elevation_deg), seen.R_up_camera)),
         },
@@ -133,7 +143,7 @@ def build_reference(
             "seed": seed,
         },
         "notes": notes,
-        "feasibility": {"caught_part_of_jet": caught},
+        "feasibility": {"caught_part_of_jet": placed.caught},
     }
     reference = Reference.from_poses(T_world_object, stage.time_s, header, resampled.confidence, resampled.video_time_s)
     return slowed(*at_speed(reference, placement.q_rad, speed))
@@ -275,7 +285,7 @@ def _least_rotation(a: Array, b: Array | None = None) -> Array:
 
 def _make_stage(
     seen: _Seen, vessel: Vessel, receptacle: Vessel, factor: float, control_hz: float
-) -> tuple[Stage, list[str], float]:
+) -> tuple[Stage, list[str], ReceptaclePlacement]:
     """Scale the path, put it on the table, stand the receptacle under the outlet."""
     notes: list[str] = []
     T = seen.T_object.copy()
@@ -295,7 +305,7 @@ def _make_stage(
     T[:, 2, 3] += rise
     if tracked is not None:
         tracked = make_pose(tracked[:3, :3], tracked[:3, 3] + [0.0, 0.0, rise])
-    placed = place_receptacle(T, vessel, receptacle, tracked, seen.ray, control_hz)
+    placed = place_receptacle(T, vessel, receptacle, tracked, control_hz)
     T[:, 2, 3] += placed.lift_m
     start_m = float(_lowest_m(T[:1], vessel)[0])
     if start_m > 0.005:
@@ -307,9 +317,18 @@ def _make_stage(
         if not reasons:
             reasons.append("the path goes lower later")
         notes.append(f"The vessel starts {100 * start_m:.1f} cm above the table: {' and '.join(reasons)}.")
+    if tracked is not None:
+        notes.append(shift_sentence(_moved_m(seen, placed), seen.ray))
     notes += placed.notes
     time_s = np.arange(len(T)) / control_hz
-    return Stage(T, time_s, vessel, receptacle, placed.T_receptacle), notes, placed.caught
+    return Stage(T, time_s, vessel, receptacle, placed.T_receptacle), notes, placed
+
+
+def _moved_m(seen: _Seen, placed: ReceptaclePlacement) -> Array:
+    """(2,) how far over the table the receptacle stands from where it was seen, if it was."""
+    if seen.T_receptacle is None:
+        return np.zeros(2)
+    return np.asarray(placed.T_receptacle[:2, 3] - seen.T_receptacle[:2, 3])
 
 
 def _along_ray(tracked: Array, T: Array, vessel: Vessel, receptacle: Vessel, control_hz: float) -> Array:

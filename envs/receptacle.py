@@ -60,13 +60,12 @@ def surface_points(vessel: Vessel, count: int = 1500) -> Array:
 
 
 def place_receptacle(
-    T: Array, vessel: Vessel, receptacle: Vessel, tracked: Array | None, ray: Array | None, control_hz: float
+    T: Array, vessel: Vessel, receptacle: Vessel, tracked: Array | None, control_hz: float
 ) -> ReceptaclePlacement:
     """Stand the receptacle on z = 0 under the jet.
 
     T: (N, 4, 4) poses of the vessel, z up, never below the table. tracked: (4, 4) where the receptacle was seen in the
-    same frame, or None; it is then moved as little as serves, and its shift along the horizontal part of `ray` (the
-    camera's line of sight) is told apart from the rest.
+    same frame, or None; it is then moved as little as serves.
     """
     notes: list[str] = []
     rim_m = float(receptacle.extents_m[2])
@@ -84,7 +83,7 @@ def place_receptacle(
         landing = jet.landing_m(rim_m - lift_m)
         centre = _best_centre(landing, jet.share, mouth, low_xyz, outer)
         if seen_xy_m is not None:
-            centre = _least_move(seen_xy_m, centre, landing, jet.share, mouth)
+            centre = _least_move(seen_xy_m, centre, landing, jet.share, mouth, low_xyz, outer)
         caught = float(jet.share @ (np.linalg.norm(landing - centre, axis=1) <= 0.9 * mouth))
         needed = float(_needed_lift_m(low_xyz, centre[None], outer)[0])
         if abs(needed - lift_m) < 1e-4:
@@ -92,8 +91,6 @@ def place_receptacle(
         lift_m = needed
     x, y = centre - mouth_xy_m(receptacle, make_pose(R))
     T_receptacle = make_pose(R, (float(x), float(y), bottom_m(receptacle)))
-    if seen_xy_m is not None:
-        notes.append(_shift_sentence(centre - seen_xy_m, ray))
     if caught < 0.7:
         notes.append(
             f"The jet wanders while pouring: the receptacle can catch about {100 * caught:.0f}% of it where it stands."
@@ -135,18 +132,21 @@ def _best_centre(landing: Array, share: Array, mouth_m: float, low_xyz: Array, o
     return np.asarray(candidates[np.argmax(worth)])
 
 
-def _least_move(seen: Array, best: Array, landing: Array, share: Array, mouth_m: float) -> Array:
-    """The point nearest to `seen` on the way to `best` that catches nearly as well as `best` does, with a margin."""
+def _least_move(
+    seen: Array, best: Array, landing: Array, share: Array, mouth_m: float, low_xyz: Array, outer_m: float
+) -> Array:
+    """The place (2,) near `seen` that catches nearly as well as `best` does, with a margin, and changes least.
 
-    def quality(centre: Array) -> float:
-        return float(share @ (np.linalg.norm(landing - centre, axis=1) <= 0.6 * mouth_m))
-
-    goal = quality(best) - 0.02
-    for part in np.linspace(0.0, 1.0, 101):
-        centre = seen + part * (best - seen)
-        if quality(centre) >= goal:
-            return np.asarray(centre)
-    return best
+    What counts is how far the receptacle moves from where it was seen and how much the vessel must rise over it.
+    """
+    angle = np.arange(12) * np.pi / 6
+    ring = np.column_stack([np.cos(angle), np.sin(angle)])
+    steps = np.linspace(0.0, 1.0, 101)[:, None]
+    near = np.concatenate([part * mouth_m * ring for part in (0.2, 0.4, 0.6, 0.8, 1.0)])
+    candidates = np.vstack([seen + steps * (best - seen), seen + near, best])
+    caught = (np.linalg.norm(landing[None] - candidates[:, None], axis=2) <= 0.6 * mouth_m) @ share
+    changed_m = np.linalg.norm(candidates - seen, axis=1) + _needed_lift_m(low_xyz, candidates, outer_m)
+    return np.asarray(candidates[np.argmin(np.where(caught >= caught[-1] - 0.02, changed_m, np.inf))])
 
 
 def _low_points(T: Array, points: Array, rim_m: float) -> Array:
@@ -182,11 +182,12 @@ def _yaw_matrix(yaw_rad: float) -> Array:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def _shift_sentence(shift: Array, ray: Array | None) -> str:
+def shift_sentence(shift: Array, ray: Array) -> str:
+    """How far (2,) the receptacle was moved, along and across the horizontal part of the camera's line of sight."""
     total_cm = 100 * float(np.linalg.norm(shift))
     if total_cm < 0.75:
         return "The receptacle stands where it was seen."
-    if ray is None or np.linalg.norm(ray[:2]) < 1e-6:
+    if np.linalg.norm(ray[:2]) < 1e-6:
         return f"The receptacle was moved by {total_cm:.0f} cm so that the jet lands in it."
     sight = ray[:2] / np.linalg.norm(ray[:2])
     along_cm = 100 * float(shift @ sight)

@@ -8,7 +8,7 @@ import pytest
 from vid2demo.demos.feasibility import feasibility, without_contact
 from vid2demo.demos.joints import JointTrajectory
 from vid2demo.demos.retarget import retarget
-from vid2demo.envs.builtin import builtin_reference
+from vid2demo.envs.builtin import builtin_reference, pour_reference
 from vid2demo.envs.clearance import overlaps_m
 from vid2demo.envs.kinematics import configuration_near, panda_chain
 from vid2demo.envs.panda import DQ_MAX_RAD_S, Q_HOME_RAD, Q_MAX_RAD, TAU_MAX_NM
@@ -199,6 +199,31 @@ def test_every_limit_is_told_with_its_margin(easy: tuple[Reference, JointTraject
         max(entry["value"] for entry in findings["speed_part_of_limit"]), rel=0.02
     )
     assert findings["variant"] is None
+
+
+def test_reach_is_the_flange_s_and_stands_beside_its_limit(easy: tuple[Reference, JointTrajectory]) -> None:
+    reference, joints = easy
+    frames = panda_chain().frames(joints.q_rad)
+    flange_m = (frames[:, 6] @ np.array([0.0, 0.0, 0.107, 1.0]))[:, :3]
+    far_m = np.linalg.norm(flange_m - frames[:, 1, :3, 3], axis=1)
+    findings = feasibility(reference, joints)
+    reach = findings["reach"]
+    assert reach["value_m"] == pytest.approx(far_m.max(), abs=1e-4)
+    assert reach["at_s"] == joints.time_s[int(far_m.argmax())]
+    assert reach["margin_m"] == pytest.approx(0.855 - far_m.max(), abs=1e-4)
+    assert any("of the 85.5 cm that the arm reaches" in words for words in findings["words"])
+
+
+@pytest.mark.slow
+def test_a_saucepan_that_fingers_cannot_hold_is_said_to_slip_and_by_how_much() -> None:
+    reference = pour_reference(make_vessel("saucepan"), make_vessel("bowl"))
+    findings = feasibility(reference, retarget(reference))
+    grip = findings["grip"]
+    assert grip["part"] > 1.0
+    assert grip["slip_m"] > 0.003
+    assert 70.0 < grip["pressing_n"] <= 140.0
+    told = f"more than the hand keeps up, it slips by about {1000 * grip['slip_m']:.1f} mm"
+    assert any(told in words for words in findings["words"])
 
 
 def test_errors_are_told_before_in_and_after_the_pour() -> None:

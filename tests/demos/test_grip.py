@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from vid2demo.demos.dynamics import Payload
-from vid2demo.demos.grip import grip_of
+from vid2demo.demos.grip import grip_of, slip_of
 from vid2demo.demos.joints import JointTrajectory
+from vid2demo.demos.retarget import retarget
+from vid2demo.envs.builtin import builtin_reference
 from vid2demo.envs.grip import PAD_RADIUS_M
 from vid2demo.envs.kinematics import panda_chain
 from vid2demo.envs.panda import FINGER_MAX_N, Q_HOME_RAD
@@ -86,3 +88,21 @@ def test_what_does_not_weigh_but_is_bulky_resists_being_turned() -> None:
         joints_of(Q_HOME_RAD + turn, 50.0), np.eye(4), Payload(0.1, np.zeros(3), np.full(3, 0.02)), WIDE_M, False
     )
     assert bulky.moment_nm > still.moment_nm + 0.1
+
+
+def test_a_mug_played_by_friction_does_not_slip_under_what_the_hand_keeps_up() -> None:
+    reference = builtin_reference()
+    slip = slip_of(reference, retarget(reference))
+    assert slip is not None
+    assert slip.pressing_n == FINGER_MAX_N
+    assert slip.distance_m < 0.002
+    assert slip.angle_rad < np.deg2rad(1.0)
+    assert "which the hand keeps up, it slips by about" in slip.sentence()
+
+
+def test_what_the_fingers_cannot_close_on_has_no_slip() -> None:
+    reference = builtin_reference()
+    T = np.array(reference.T_hand_object)
+    T[1, 3] += 0.3
+    beside = reference.with_header(T_hand_object=T.tolist())
+    assert slip_of(beside, retarget(reference)) is None

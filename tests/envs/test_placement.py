@@ -180,7 +180,9 @@ def test_a_receptacle_seen_at_the_wrong_depth_is_moved_along_the_line_of_sight_a
     true = mug_track(track)
     far = changed(true, T_camera_object=_farther(true.T_camera_object, 1.15))
     reference = build_reference(track, far)
-    assert any("camera (a single camera measures depth badly)" in note for note in reference.notes)
+    moved_m = reference.header["changed"]["receptacle_moved_to_jet_m"]
+    assert 0.1 < moved_m < 0.25
+    assert any("cm toward the camera (a single camera measures depth badly)" in note for note in reference.notes)
     assert reference.header["feasibility"]["caught_part_of_jet"] > 0.9
 
 
