@@ -12,6 +12,7 @@ where OpenCV was built without it), or solved by PnP from the corners of the box
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import os
 import resource
@@ -53,6 +54,9 @@ KETTLE_BOX_PX = (345.0, 297.0, 488.0, 342.0)
 TURNED_BOX_M = (0.250, 0.197, 0.073)
 TURNED_BOX_PX = (292.0, 10.0, 304.0, 232.0)
 
+BANDS = (0.0, 0.5, 0.7, 0.8, 0.9, 0.95, 1.01)  # of confidence
+RIGHT_RAD = np.deg2rad(12)
+
 Row = dict[str, Any]
 
 
@@ -89,6 +93,8 @@ def main() -> None:
         if arguments.json:
             arguments.json.write_text(json.dumps(rows, indent=2) + "\n")
     print("\n" + _table(rows))
+    if drawn := [row for row in rows if "bands" in row]:
+        print("\n" + _summary(drawn))
 
 
 def _measured(name: str, data: Path) -> list[Row]:
@@ -152,6 +158,7 @@ def synthetic(name: str, folder: Path) -> list[Row]:
     row |= _errors(track, truth, None)
     far_m, far_truth_m = (np.linalg.norm(t.T_camera_object[:, :3, 3], axis=1) for t in (track, truth))
     row["distance_mm"] = 1e3 * float(np.mean(np.abs(far_m - far_truth_m)))
+    row["bands"] = _bands(track, truth)
     library = clip.truth.header["mesh"]["library"]
     model = make_vessel(library["category"], None, **library["params"]).mesh
     return [row, *_beside(clip.video, box, truth, model, False)]
@@ -201,6 +208,38 @@ def _errors(track: ObjectTrack, truth: Truth, model: Any | None) -> Row:
     if poses.adds_auc_percent is not None:
         row |= {"adds_auc_percent": poses.adds_auc_percent, "worst_stretch": poses.worst_stretch}
     return row
+
+
+def _bands(track: ObjectTrack, truth: Truth) -> list[list[float]]:
+    """Of the frames in each band of confidence: number, sum of what was said, upright axis right, all turns right."""
+    T, G = track.T_camera_object[:, :3, :3], truth.T_camera_object[:, :3, :3]
+    symmetry = truth.symmetry or Symmetry()
+    tilt_rad = np.arccos(np.clip(np.sum(T[:, :, 2] * G[:, :, 2], axis=1), -1, 1))
+    turn_rad = symmetry.error_rad(T, G)
+    bands = []
+    for low, high in itertools.pairwise(BANDS):
+        here = (track.confidence >= low) & (track.confidence < high)
+        right = [int(np.sum(here & (error < RIGHT_RAD))) for error in (tilt_rad, turn_rad)]
+        bands.append([int(here.sum()), float(track.confidence[here].sum()), *right])
+    return bands
+
+
+def _summary(rows: list[Row]) -> str:
+    """The synthetic clips together, and how often a frame was right that was said to be so with a confidence."""
+    turned, moved = (np.array([row[key] for row in rows]) for key in ("aligned_deg", "projected_percent"))
+    lines = [
+        f"{len(rows)} synthetic clips: aligned rotation error median {np.median(turned):.1f}, mean {turned.mean():.1f} "
+        f"deg, {np.sum(turned <= 5)} within 5; projected error mean {moved.mean():.2f} %, {np.sum(moved <= 1)} within "
+        f"1; {np.sum([row['visible_percent'] < 100 for row in rows])} lost for a while",
+        "",
+        f"| confidence | frames | said | axis within {np.rad2deg(RIGHT_RAD):.0f} deg | with the spin |",
+        "| --- " * 5 + "|",
+    ]
+    bands = np.sum([row["bands"] for row in rows], axis=0)
+    for (low, high), (count, said, axis, whole) in zip(itertools.pairwise(BANDS), bands, strict=True):
+        share = [f"{100 * value / max(count, 1):.0f} %" for value in (said, axis, whole)]
+        lines.append(f"| {low:.2f} to {min(high, 1.0):.2f} | {count:.0f} | " + " | ".join(share) + " |")
+    return "\n".join(lines)
 
 
 def _beside(

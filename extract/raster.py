@@ -6,7 +6,7 @@ coordinates, and the window may reach beyond the image so that an object half ou
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numba
 import numpy as np
@@ -47,6 +47,13 @@ class DepthWindow:
         """The silhouette in the part of the image that the window covers, and that part's rows and columns."""
         inner, place = self._cut(width_px, height_px)
         return np.asarray(self.depth_m[inner] > 0), place
+
+    def only(self, mask: NDArray[np.bool_]) -> DepthWindow:
+        """The same with nothing hit where a mask (H, W) of the image is false."""
+        depth = self.depth_m.copy()
+        inner, place = self._cut(mask.shape[1], mask.shape[0])
+        depth[inner][~mask[place]] = 0.0
+        return replace(self, depth_m=depth)
 
     def _cut(self, width_px: int, height_px: int) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
         """Rows and columns that window and image share, in the window and in the image; empty if they share none."""

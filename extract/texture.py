@@ -2,8 +2,10 @@
 
 A key view is a frame whose pose is known well. Its picture is carried over the mesh to the pose that is predicted, so
 that little motion is left for pyramidal Lucas-Kanade flow whatever the turn since, and every match ties a pixel of the
-new frame to a point of the mesh as the key view has it: nothing is chained from frame to frame. Flow forth and back
-must agree, and RANSAC over poses must agree with the rest.
+new frame to a point of the mesh as the key view has it. Flow forth and back must agree, and RANSAC over poses must
+agree with the rest. With the object's own mesh nothing is chained from frame to frame. A mesh that is only like the
+object puts its points at depths that are a little wrong, which shows the more the farther the object has turned since
+the key view: there such views count less, and the frame before is a view as well.
 
 A mirror-bright object shows its surroundings, which move otherwise than it does. `trust` learns from every frame
 whether the matches are rigid and whether they contradict the outline; what is not trusted is measured but not used.
@@ -22,6 +24,7 @@ from .geometry import Array, angle_between_rad, invert_pose, make_pose
 from .raster import DepthWindow, render_depth
 from .region import Points, TrackingMesh
 from .region_kernels import draw_view, solve_pose
+from .segment import Mask
 from .video import Image
 
 FLATTEN_PX = 8.0  # shading and exposure, wider than this, are taken out of the pictures
@@ -31,6 +34,8 @@ FORTH_AND_BACK_PX = 0.7
 ALIKE = 0.5  # mean difference of two patches, in their mean contrast
 RANSAC_PX, RANSAC_ROUNDS = 2.5, 40
 POINT_STD_PX = 0.5
+UNLIKE = 0.15  # of its radius, by which points of a mesh that is only like the object are off in depth
+CHAIN_STD_PX = 1.0  # more for the frame before: what is chained drifts, which outline and key views must mend
 ENOUGH = 12  # inliers that say something
 VIEWS_APART_RAD = np.deg2rad(12)
 VIEWS_REACH_RAD = np.deg2rad(35)
@@ -53,35 +58,47 @@ class KeyView:
 
 @dataclass(frozen=True)
 class Matches:
-    """Points found in a frame that agree with one pose, the share of all matches that did, and that pose."""
+    """Points found in a frame that agree with one pose, the share of all matches that did, and that pose.
+
+    keyed: (N,) which of the points a key view had; those of the frame before agree with wrong poses as well.
+    """
 
     points: Points
     rigid_share: float
     T_camera_object: Array | None
+    keyed: NDArray[np.bool_]
 
     def __len__(self) -> int:
         return len(self.points.weight)
 
 
-NO_MATCHES = Matches(Points.none(), 0.0, None)
+NO_MATCHES = Matches(Points.none(), 0.0, None, np.zeros(0, bool))
 
 
 class Texture:
-    """The key views of one object and how far its texture is trusted, in [0, 1]."""
+    """The key views of one object and how far its texture is trusted, in [0, 1].
 
-    def __init__(self, mesh: TrackingMesh):
+    exact: whether the mesh is the object's own, or only like it.
+    """
+
+    def __init__(self, mesh: TrackingMesh, exact: bool = True):
         self.mesh, self.trust = mesh, FIRST_TRUST
         self.views: list[KeyView] = []
+        self._before: KeyView | None = None
+        self._off_m = 0.0 if exact else UNLIKE * mesh.radius_m
 
     def match(self, picture: NDArray[np.uint8], camera_matrix: Array, T_predicted: Array) -> Matches:
-        """Match a flattened picture against the nearest key view and the oldest near enough."""
+        """Match a flattened picture against the nearest key view, the oldest near enough and the frame before."""
         views = self._views_for(T_predicted)
+        if self._before is not None:
+            views.append(self._before)
         depth = render_depth(self.mesh.vertices_m, self.mesh.faces, T_predicted, camera_matrix) if views else None
         if depth is None:
             return NO_MATCHES
         found = [_matched(view, picture, camera_matrix, T_predicted, depth) for view in views]
         object_m = np.concatenate([points for points, _ in found])
         pixel = np.concatenate([pixels for _, pixels in found])
+        std_px = np.repeat([self._std_px(v, T_predicted, camera_matrix) for v in views], [len(f[1]) for f in found])
         if len(pixel) < ENOUGH:
             return NO_MATCHES
         cv2.setRNGSeed(0)  # RANSAC draws from OpenCV's global generator
@@ -95,8 +112,9 @@ class Texture:
         if not good or kept is None or len(kept) < ENOUGH:
             return replace(NO_MATCHES, rigid_share=0.0 if kept is None else len(kept) / len(pixel))
         kept = kept[:, 0]
-        points = Points(object_m[kept], pixel[kept], np.full(len(kept), (self.trust / POINT_STD_PX) ** 2))
-        return Matches(points, len(kept) / len(pixel), _pose_from(points, camera_matrix, T_predicted))
+        points = Points(object_m[kept], pixel[kept], (self.trust / std_px[kept]) ** 2)
+        keyed = np.repeat([view is not self._before for view in views], [len(f[1]) for f in found])[kept]
+        return Matches(points, len(kept) / len(pixel), _pose_from(points, camera_matrix, T_predicted), keyed)
 
     def judge(self, matches: Matches, strain: float) -> None:
         """Learn from a frame: were there matches, did they move like one rigid body, did the outline object?"""
@@ -109,16 +127,36 @@ class Texture:
             calm = max(calm, np.interp(matches.rigid_share, BEYOND_DOUBT, (0.0, 1.0)))
         self.trust += TRUST_RATE * float(rigid * calm - self.trust)
 
-    def keep(self, picture: NDArray[np.uint8], camera_matrix: Array, T_camera_object: Array) -> None:
-        """Make a frame a key view if no other shows the object from nearly the same side."""
-        if len(self.views) >= MOST_VIEWS:
-            return
-        towards = _towards(T_camera_object)
-        if any(angle_between_rad(towards, _towards(v.T_camera_object)) < VIEWS_APART_RAD for v in self.views):
+    def keep(
+        self,
+        picture: NDArray[np.uint8],
+        camera_matrix: Array,
+        T_camera_object: Array,
+        ours: Mask | None = None,
+        key: bool = True,
+    ) -> None:
+        """Keep a frame to match the next one to, and as a key view if no other shows the object from nearly that side.
+
+        ours: (H, W) where it shows the object, and nothing that hides it; all of the silhouette when not given.
+        """
+        apart = [angle_between_rad(_towards(T_camera_object), _towards(v.T_camera_object)) for v in self.views]
+        key = key and len(self.views) < MOST_VIEWS and all(angle >= VIEWS_APART_RAD for angle in apart)
+        if not (key or self._off_m > 0.0):
             return
         depth = render_depth(self.mesh.vertices_m, self.mesh.faces, T_camera_object, camera_matrix)
-        if depth is not None:
-            self.views.append(KeyView(picture, camera_matrix, T_camera_object, depth))
+        if depth is None:
+            return
+        view = KeyView(picture, camera_matrix, T_camera_object, depth if ours is None else depth.only(ours))
+        if key:
+            self.views.append(view)
+        if self._off_m > 0.0:
+            self._before = view
+
+    def _std_px(self, view: KeyView, T: Array, camera_matrix: Array) -> float:
+        """Standard deviation of where a view's points are in a frame, whose pose is about T."""
+        turn = float(angle_between_rad(_towards(T), _towards(view.T_camera_object)))
+        off_px = self._off_m * np.sin(turn) * camera_matrix[0, 0] / T[2, 3]
+        return float(np.hypot(np.hypot(POINT_STD_PX, off_px), CHAIN_STD_PX if view is self._before else 0.0))
 
     def _views_for(self, T: Array) -> list[KeyView]:
         angles = [float(angle_between_rad(_towards(T), _towards(v.T_camera_object))) for v in self.views]

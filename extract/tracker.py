@@ -33,6 +33,7 @@ ON_SURFACE = 0.9  # least share of the depth readings on a right pose's mesh
 LEARNING_RATE = 0.15
 LEARN_ABOVE = 0.5  # a frame the tracker is unsure of teaches it nothing
 KEY_ABOVE = 0.8
+OURS_PX = 7  # over which colours are smoothed that tell where an object shows
 LOST_BELOW = 0.25
 FOUND_ABOVE = 0.5  # what was lost must be surer to be found than what is held must be to be kept
 VELOCITY_KEPT = 0.7  # hands accelerate: half-trusting the last velocity beats trusting it or ignoring it
@@ -138,12 +139,13 @@ class ObjectTracker:
     ):
         self.mesh, self.camera_matrix = mesh, camera_matrix
         self.symmetry = symmetry or Symmetry()
-        self.colours, self.texture = ColourModel(), Texture(mesh)
+        self.colours, self.texture = ColourModel(), Texture(mesh, exact)
         self.background = background
         self.signs = Signs(0.0, 0.0, 0.0)
         self.textured_frames = 0
         self._depth: DepthView | None = None
         self._surface: Surface | None = None
+        self._exact = exact
         self._farther, self._mesh_error_m = 1.0, 0.0 if exact else LIKENESS * mesh.radius_m
         self._pose: Array = T_camera_object
         self._velocity: Array = np.zeros(6)
@@ -157,8 +159,7 @@ class ObjectTracker:
         inside = None if self._outline is None else self._outline.inside((mask.shape[0], mask.shape[1]))
         if inside is not None:
             inside.teach(self.colours, bins, 1.0)
-        part = self._around(rgb, T_camera_object)
-        self.texture.keep(part.picture, part.camera_matrix, T_camera_object)
+        self._keep(self._around(rgb, T_camera_object), T_camera_object, key=True)
 
     def step(self, rgb: Image, guess: Array | None = None, depth: DepthView | None = None) -> Estimate:
         """Pose in the next frame, refined from where the motion so far leads or from `guess`, which is preferred.
@@ -210,8 +211,16 @@ class ObjectTracker:
         self.texture.judge(fit.matches, fit.strain)
         if fit.confidence >= LEARN_ABOVE and fit.outline is not None:
             fit.outline.teach(self.colours, part.bins, LEARNING_RATE)
-            if fit.confidence >= KEY_ABOVE:
-                self.texture.keep(part.picture, part.camera_matrix, T)
+        self._keep(part, T, key=fit.confidence >= KEY_ABOVE)
+
+    def _keep(self, part: _Part, T: Array, key: bool) -> None:
+        """Remember the texture of a frame; of a mesh only like the object where its colours are, not the hand's."""
+        ours = None
+        if not self._exact:
+            evidence = object_evidence(part.bins, self.colours)
+            evidence[part.bins == HIDDEN_BIN] = -1.0
+            ours = np.asarray(cv2.blur(evidence, (OURS_PX, OURS_PX)) > 0)
+        self.texture.keep(part.picture, part.camera_matrix, T, ours, key)
 
     def _predicted(self) -> Array:
         """Constant velocity, damped; of the turn of a body of revolution only what can be seen."""
@@ -260,8 +269,8 @@ class ObjectTracker:
         offset_px, _ = lines.residuals(T, part.camera_matrix)
         agree = float(np.mean((np.abs(offset_px) < 2.0) & (lines.variance_px2 < 9.0)))
         rigid = 0.0
-        if len(matches):
-            held = np.mean(matches.points.errors_px(T, part.camera_matrix) < 2.0)
+        if matches.keyed.any():
+            held = np.mean(matches.points.errors_px(T, part.camera_matrix)[matches.keyed] < 2.0)
             rigid = float(held * matches.rigid_share * self.texture.trust)
         x, y = np.round(outline.pixel).astype(int).T
         told = outline.select(part.bins[y, x] != HIDDEN_BIN)

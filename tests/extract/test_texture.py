@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -9,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from vid2demo.extract.geometry import Symmetry, focal_prior_camera_matrix, make_pose, rotation_angle_rad
 from vid2demo.extract.raster import render_depth
 from vid2demo.extract.region import TrackingMesh
-from vid2demo.extract.texture import Matches, Texture, flattened
+from vid2demo.extract.texture import Texture, flattened
 from vid2demo.extract.tracker import ObjectTracker, Signs
 
 WIDTH, HEIGHT = 320, 240
@@ -93,6 +95,46 @@ def test_a_spin_that_only_the_label_shows_is_followed(can: TrackingMesh) -> None
     assert tracker.spin_source(30) == "texture"
 
 
+def test_the_frame_before_helps_where_no_key_view_shows_that_side(can: TrackingMesh) -> None:
+    printed, turned = label(), pose(42.0)
+    found = {}
+    for exact in (True, False):
+        texture = Texture(can, exact)
+        texture.keep(flattened(picture(can, pose(0), 0, printed)), K, pose(0))
+        texture.keep(flattened(picture(can, pose(40.0), 0, printed)), K, pose(40.0), key=False)
+        found[exact] = texture.match(flattened(picture(can, turned, 1, printed)), K, pose(40.0))
+    assert len(found[True]) == 0
+    assert len(found[False]) > 25
+    # What moves as the frame before does not tell that the pose is right.
+    assert not found[False].keyed.any()
+
+
+def test_views_turned_away_count_less_when_the_mesh_is_only_like_the_object(can: TrackingMesh) -> None:
+    printed, turned = label(), pose(15.0)
+    weights = {}
+    for exact in (True, False):
+        texture = Texture(can, exact)
+        texture.keep(flattened(picture(can, pose(0), 0, printed)), K, pose(0))
+        texture.keep(flattened(picture(can, pose(13.0), 0, printed)), K, pose(13.0), key=False)
+        found = texture.match(flattened(picture(can, turned, 1, printed)), K, turned)
+        assert found.keyed.any()
+        weights[exact] = found.points.weight[found.keyed].mean()
+        if not exact:
+            assert not found.keyed.all()
+            assert found.points.weight[~found.keyed].mean() > weights[exact]
+    assert weights[False] < 0.5 * weights[True]
+
+
+def test_nothing_is_matched_where_a_frame_does_not_show_the_object(can: TrackingMesh) -> None:
+    texture, printed = Texture(can), label()
+    left = np.zeros((HEIGHT, WIDTH), bool)
+    left[:, : WIDTH // 2] = True
+    texture.keep(flattened(picture(can, pose(0), 0, printed)), K, pose(0), left)
+    found = texture.match(flattened(picture(can, pose(0), 1, printed)), K, pose(0))
+    assert len(found) > 12
+    assert found.points.pixel[:, 0].max() < WIDTH // 2 + 2
+
+
 def test_a_spin_that_nothing_shows_is_not_invented(can: TrackingMesh) -> None:
     tracker = tracker_at(can, pose(0), None)
     for k in range(1, 21):
@@ -118,11 +160,11 @@ def test_what_is_not_rigid_or_contradicts_the_outline_loses_trust(can: TrackingM
         texture.judge(found, 0.0)
     trusted = texture.trust
     for _ in range(30):
-        texture.judge(Matches(found.points, 0.4, None), 0.0)
+        texture.judge(replace(found, rigid_share=0.4), 0.0)
     assert trusted > 0.8
     assert texture.trust < 0.1
     for _ in range(30):
-        texture.judge(Matches(found.points, 0.8, None), 2.0)
+        texture.judge(replace(found, rigid_share=0.8), 2.0)
     assert texture.trust < 0.1
 
 
