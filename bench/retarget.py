@@ -10,7 +10,7 @@ no worse than inverse kinematics in mean error, torque and jerk at once, and `wi
 none by more. On an exact track nothing is to be smoothed: its jerk is what there is, and followed 40 times closer than
 by inverse kinematics, whose lag of a few micrometres rounds it off, single pours have up to 5% more of it. `weights`:
 what the pull toward the track trades. `execute`: with what `--scale auto` chose, the controller's errors over the whole
-motion, and what was poured.
+motion, and what was poured; `faithful` is what the motion poured and spilled as it was seen.
 `time`: one core's time for 250 knots, inverse kinematics included.
 """
 
@@ -181,6 +181,7 @@ def execute_pour(pour: Pour, particles: int, grasp: str) -> dict[str, Any]:
         "limit_part": max(e.part for e in found if e.quantity != "torque rate"),
         "collisions": len(findings["collisions"]),
         "changed": changed(reference),
+        "faithful": faithful(reference),
         "poured": episode.summary["poured_fraction"],
         "spilled": episode.summary["spilled_fraction"],
     }
@@ -191,6 +192,12 @@ def changed(reference: Reference) -> str:
     chosen = next(t for t in reference.header["scale_search"] if t["chosen"])
     moved_cm = 100 * float(np.hypot(chosen["along_m"], chosen["across_m"]))
     return f"x{chosen['scale']:.2f} {moved_cm:.0f}cm +{chosen['tip_deg']:.0f}deg"
+
+
+def faithful(reference: Reference) -> str:
+    """Poured and spilled fraction of the first try of `--scale auto`, the motion as it was seen."""
+    first = reference.header["scale_search"][0]
+    return f"{first['poured']:.2f} {first['spilled']:.2f}"
 
 
 def table_time(pours: list[Pour]) -> list[dict[str, Any]]:

@@ -60,5 +60,9 @@ def weight_part(
 
 
 def pressing_n(part: float) -> float:
-    """What each finger presses with for a weight that takes this part of the grip: more than usual only if it must."""
+    """What each finger presses with for a weight that takes this part of the grip: more than usual only if it must.
+
+    The usual is the force that the datasheet calls continuous. Up to the maximum force is lent to simulated pours by
+    heavy vessels, though nobody states how long a real hand may keep that up: reports say which pours need it.
+    """
     return float(np.clip(FINGER_MAX_N * part / HOLDS, FINGER_MAX_N, FINGER_PEAK_N))
