@@ -224,7 +224,8 @@ def _track_plots(found: Found) -> str:
     track = found.tracks.get(found.name)
     if track is None:
         return _missing(f"{found.name}.track.npz", "extract")
-    T, time_s = track.T_camera_object, track.time_s
+    T, time_s = track.from_first_camera().T_camera_object, track.time_s
+    where = "the camera frame" if track.T_first_camera is None else "the first frame's camera"
     axis = T[:, :3, :3] @ np.asarray(track.symmetry.axis)
     lean_deg = np.rad2deg(angle_between_rad(axis, np.broadcast_to(axis[0], axis.shape)))
     hidden = ~track.visible
@@ -234,7 +235,7 @@ def _track_plots(found: Found) -> str:
     ]
     return "".join(
         (
-            chart(f"{found.name}: position in the camera frame", "m", time_s, position, hidden=hidden, clock="overlay"),
+            chart(f"{found.name}: position in {where}", "m", time_s, position, hidden=hidden, clock="overlay"),
             chart(f"{found.name}: tilt since the first frame", "°", time_s, [Line("tilt", lean_deg)], hidden=hidden,
                   limits=(0.0, None), clock="overlay"),
             chart("confidence", "0 to 1", time_s, trust, hidden=hidden, limits=(0.0, 1.0), clock="overlay"),

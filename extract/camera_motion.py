@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .geometry import Array, scaled_camera
+from .geometry import Array, make_pose, scaled_camera
 from .segment import Box, Mask
 from .video import Image
 
@@ -60,21 +60,9 @@ class CameraMotion:
     rotates_only: bool
 
     @property
-    def R_first_camera(self) -> Array:
-        """(N, 3, 3) orientation of each frame's camera in the first frame's camera."""
-        return np.asarray(np.swapaxes(self.R_camera_first, 1, 2))
-
-
-def compensated(T_camera_object: Array, motion: CameraMotion) -> Array:
-    """T_first_camera_object (N, 4, 4): poses seen by the camera of the first frame, for a camera that turns in place.
-
-    T_camera_object: (N, 4, 4). Raises ValueError for another number of frames than the motion has.
-    """
-    if len(T_camera_object) != len(motion.R_camera_first):
-        raise ValueError(f"{len(T_camera_object)} poses, {len(motion.R_camera_first)} frames of camera motion")
-    out = np.array(T_camera_object, float)
-    out[:, :3] = motion.R_first_camera @ out[:, :3]
-    return out
+    def T_first_camera(self) -> Array:
+        """(N, 4, 4) pose of each frame's camera in the first frame's, for a camera that turns in place."""
+        return np.stack([make_pose(R.T) for R in self.R_camera_first])
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import numpy as np
 from .camera_motion import CameraWatch
 from .camera_path import camera_path
 from .camera_scale import path_scale
-from .geometry import Array, make_pose
+from .geometry import Array
 from .track import ObjectTrack
 
 SURE_OF_CAMERA = 0.5  # median share of the background that agrees on how the camera turned or moved
@@ -47,9 +47,11 @@ def _camera(
     T_first_camera, words = _moved(tracks, watch)
     if T_first_camera is not None:
         return T_first_camera, {**told, **words, "kind": "moving"}
-    # A rotation is a poor account of a camera that moves sideways, but better than none for one said to move.
-    if asked == "moving" or (motion.rotates_only and quality > SURE_OF_CAMERA):
-        return np.stack([make_pose(R) for R in motion.R_first_camera]), {**told, **words, "kind": "turning"}
+    if motion.rotates_only and quality > SURE_OF_CAMERA:
+        return motion.T_first_camera, {**told, "kind": "turning"}
+    if asked == "moving":
+        # A rotation is a poor account of a camera that moves sideways, but better than none for one said to move.
+        return motion.T_first_camera, {**told, **words, "kind": "turning"}
     return None, {**told, **words, "kind": "moving, not compensated"}
 
 

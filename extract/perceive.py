@@ -103,7 +103,7 @@ def extract(
     object's own tells (focal.py) where that is sure.  The first request is the handled
     object, the others are receptacles.  start_frame: what boxes and masks belong to; when None the first, or another
     that shows the objects better where nobody pointed at them.  camera_motion: "static" does not look whether the
-    camera moves; "moving" takes it to turn even where that explains only a part of what is seen.
+    camera moves; "moving" takes it to turn where no path can be told, however little of what is seen that explains.
     depth: folder or array of depth pictures aligned to the frames, a step of which is depth_scale_mm (depth_video.py);
     sizes of vessels and distances are then measured instead of guessed.
     progress: called with (done, total, what).

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from .errors import UserError
 from .progress import Progress
 from .stages import Stage, plain
-from .wording import symmetry_in_words, unseen_in_words
+from .wording import motion_in_words, symmetry_in_words, unseen_in_words
 
 if TYPE_CHECKING:
     from .choose import Level
@@ -175,7 +175,7 @@ def _track_figures(track: Any) -> dict[str, Any]:
         figures["not_seen"] = unseen
     camera = track.header["camera"]
     if camera["motion"]["kind"] != "static":
-        figures["camera"] = camera["motion"]["kind"]
+        figures["camera"] = motion_in_words(camera["motion"])
     if "depth" in how:
         sized = "sizes and distances" if how["depth"]["size_source"] == "depth" else "distances"
         figures["depth"] = f"{sized} measured by {how['depth']['file']}"

@@ -53,3 +53,10 @@ def as_lines(value: Mapping[str, Any], depth: int = 0) -> list[str]:
         else:
             lines.append(f"{name}: {f'{item:.4g}' if isinstance(item, float) else item}")
     return lines
+
+
+def motion_in_words(motion: Mapping[str, Any]) -> str:
+    """header["camera"]["motion"] for a reader."""
+    if "path_m" in motion:
+        return f"moving, over {motion['path_m']:.2f} m, give or take {motion['scale_std']:.1%}"
+    return f"{motion['kind']}: {motion['why_not']}" if "why_not" in motion else str(motion["kind"])

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from vid2demo.extract.camera_motion import CameraMotion, CameraWatch, compensated
+from vid2demo.extract.camera_motion import CameraMotion, CameraWatch
 from vid2demo.extract.geometry import focal_prior_camera_matrix, invert_pose, make_pose, rotation_angle_rad
 from vid2demo.extract.video import iterate_frames
 
@@ -65,7 +65,7 @@ def test_known_turns_are_measured(panned: CameraMotion) -> None:
 def test_a_thing_that_stands_in_the_world_stands_still_after_compensation(panned: CameraMotion) -> None:
     T_first_object = make_pose(Rotation.from_rotvec([0.3, 0.2, 0.1]).as_matrix(), (0.1, 0.05, 0.8))
     T_first_camera = np.stack([make_pose(turn(k).T) for k in range(COUNT)])
-    found = compensated(invert_pose(T_first_camera) @ T_first_object, panned)
+    found = panned.T_first_camera @ invert_pose(T_first_camera) @ T_first_object
     assert np.linalg.norm(found[:, :3, 3] - T_first_object[:3, 3], axis=1).max() < 0.003
     assert np.rad2deg(rotation_angle_rad(found[:, :3, :3], T_first_object[:3, :3])).max() < 0.2
 
@@ -76,8 +76,7 @@ def test_a_standing_camera_stands_whatever_moves_before_it(leave_out: bool) -> N
     assert motion.static
     assert motion.stray_px < 0.1
     assert not motion.rotates_only
-    poses = np.tile(make_pose(t=(0.1, 0.0, 0.7)), (COUNT, 1, 1))
-    assert compensated(poses, motion) == pytest.approx(poses, abs=1e-6)
+    assert motion.T_first_camera == pytest.approx(np.tile(np.eye(4), (COUNT, 1, 1)), abs=1e-6)
 
 
 def test_a_wall_passed_sideways_is_no_turn() -> None:
@@ -118,11 +117,28 @@ def test_masks_and_large_frames_are_taken() -> None:
     assert watch.result().H_frame_first[-1] @ [640, 480, 1] == pytest.approx([680, 480, 1], abs=1.5)
 
 
-def test_misuse_is_refused(panned: CameraMotion) -> None:
+def test_asked_before_the_first_frame_it_refuses() -> None:
     with pytest.raises(ValueError, match="no frame"):
         CameraWatch(K).result()
-    with pytest.raises(ValueError, match="3 poses"):
-        compensated(np.tile(np.eye(4), (3, 1, 1)), panned)
+
+
+def test_corners_keep_their_numbers_and_standing_frames_share_theirs() -> None:
+    """What the path of a camera is told from: a number is one place of the texture, in whatever frame."""
+    watch = CameraWatch(K)
+    shifts = np.array([0.0, 0, 0, 4, 8, 12, 16, 20, 24, 28, 32, 36, 40, 44, 44, 44])
+    for shift in shifts:
+        watch.step(seen(np.array([[1, 0, shift], [0, 1, 0], [0, 0, 1]]), 0, noise=0.0), boxes=[BOX])
+    first = watch.sightings[0]
+    assert first is not None
+    assert watch.sightings[2] is first
+    assert sum(s is not None and s.view for s in watch.sightings) < len(shifts)
+    for sighting, shift in zip(watch.sightings, shifts, strict=True):
+        assert sighting is not None
+        _, a, b = np.intersect1d(first.ids, sighting.ids, return_indices=True)
+        assert len(a) > 20
+        moved = sighting.pixels[b] - first.pixels[a]
+        assert np.median(moved, axis=0) == pytest.approx([shift, 0], abs=0.1)
+        assert np.mean(np.abs(moved - [shift, 0]) < 0.5) > 0.97
 
 
 @needs_data
