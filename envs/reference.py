@@ -41,8 +41,9 @@ class Reference:
     header: JSON-like; `symmetry`, `vessel` ({"library": {category, params}} or {"file", "unit", "up", ...}),
         `receptacle` (the same and `T_world_receptacle`), `T_hand_object` (4x4, object in `panda_hand_tcp`),
         `q_start_rad` (7), `grasp`, `scale`, `time_stretch`, `T_world_camera`, `notes` (list of sentences), `changed`
-        (leaps of the tracker that were bridged, by how much the camera was turned upright), `scale_search` (the pours
-        tried and what came of them), `feasibility`.
+        (leaps of the tracker that were bridged, by how much the camera was turned upright, how far the vessel was
+        lifted over the rim and the receptacle moved to the jet, contacts given way to), `scale_search` (the pours tried
+        and what came of them), `feasibility`.
     """
 
     T_world_object: Array
