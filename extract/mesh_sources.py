@@ -93,7 +93,8 @@ def _source(path: Path, root: Path, of_uid: Mapping[str, str], category: str | N
         found = parents[-1]
     else:
         found = _from_name(name)
-    return MeshSource(name, category if category is not None else found.replace(" ", "_"), str(path))
+    # The whole path: results that name the mesh are read from other folders too.
+    return MeshSource(name, category if category is not None else found.replace(" ", "_"), str(path.resolve()))
 
 
 def _listed(file: Path) -> list[MeshSource]:

@@ -30,8 +30,8 @@ UNLIKE = 0.6  # share from which a superpixel is unlike the background
 EDGE_PERCENT = 98.0  # of the picture have a weaker edge than the clear ones
 SMALLEST, LARGEST = 0.0012, 0.25  # of the picture
 TRIED = 150  # regions of both trees that are compared
-OVERLAP = 0.6  # of two regions, from which the better one alone is proposed
-LEAST_SCORE = 0.05
+SHARED = 0.5  # of the smaller of two regions, from which the likelier one alone is proposed
+LEAST_SCORE = 0.12
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class Tree:
 
 
 def likely_regions(rgb: Image, most: int) -> list[Region]:
-    """At most `most` regions of a picture (H, W, 3), likeliest first; they overlap no more than OVERLAP."""
+    """At most `most` regions of a picture (H, W, 3), likeliest first; none is a part of another."""
     if min(rgb.shape[:2]) < 3 * CELL_PX:
         return []
     pixels = superpixels(rgb, np.asarray(cv2.blur(unlike_background(rgb), (3, 3)), np.float32))
@@ -87,7 +87,7 @@ def likely_regions(rgb: Image, most: int) -> list[Region]:
     kept: list[int] = []
     for k in np.argsort(-scores, kind="stable"):
         common = (members[kept] & members[k]) @ pixels.area_px
-        if len(kept) < most and scores[k] > LEAST_SCORE and np.all(common <= OVERLAP * (area[kept] + area[k] - common)):
+        if len(kept) < most and scores[k] > LEAST_SCORE and np.all(common <= SHARED * np.minimum(area[kept], area[k])):
             kept.append(int(k))
     return [Region(np.asarray(members[k][pixels.labels]), float(scores[k])) for k in kept]
 

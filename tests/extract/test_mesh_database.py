@@ -54,6 +54,16 @@ def test_every_mesh_of_a_folder_is_stored_under_its_own_name(tmp_path: Path) -> 
     assert store.check() == []
 
 
+def test_a_mesh_of_a_folder_named_from_here_is_found_from_elsewhere(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_boxes(tmp_path / "in", 1)
+    monkeypatch.chdir(tmp_path)
+    (source,) = find_sources(Path("in"))
+    monkeypatch.chdir("/")
+    assert Path(read_source(source).about.source).is_file()
+
+
 def test_normalisation_can_be_undone_and_keeps_the_size(tmp_path: Path) -> None:
     box = trimesh.creation.box([120.0, 80.0, 40.0])  # millimetres
     box.apply_translation([7.0, -3.0, 50.0])
