@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from .colours import mask_evidence
 from .first_pose import edge_score, silhouette_ious, upright_rotation
-from .geometry import Array, make_pose, scaled_camera
+from .geometry import Array, make_pose, projected_box, scaled_camera
 from .handled import Handled, find_handled, reach_from_border
 from .raster import render_depth
 from .region import TrackingMesh, edge_strength, extract_outline, refine
-from .segment import Box, Mask, mask_box, mask_from_box
+from .segment import Box, Mask, box_iou, mask_box, mask_from_box
 from .video import Image
 
 SEARCH_WIDTH_PX = 240
@@ -33,9 +33,11 @@ MOVED_LAB = 14.0  # colour change, in Lab units, that counts as motion
 LEAST_MERIT = 1.2
 MOVED_SHARE = 0.4  # of what is handled, least, where more than SOMETHING_MOVED of the picture moves
 SOMETHING_MOVED = 0.005
-EXPLAINED_WEIGHT = 2.0
-ON_THING = 0.6  # of a silhouette, least, for the thing to be its object
+EXPLAINED_WEIGHT, REACHED_WEIGHT = 2.0, 1.0
+HAND_REACH = 0.65  # of the way from the picture's border to the farthest that moves: no sleeve goes so far
 REFINED = 8
+PLACES, PLACES_WITHIN = 3, 0.3
+SAME_PLACE = 0.8  # of two boxes, intersection over union from which on one is as good as the other
 
 
 @dataclass(frozen=True)
@@ -63,6 +65,11 @@ class _Arm:
         ]
         return _Arm(reach, *small)
 
+    def reached(self, silhouette: Mask) -> float:
+        """How far out along the arm a silhouette is, in [0, 1]: hands hold things, sleeves do not."""
+        here = self.reach[silhouette & (self.reach > 0)]
+        return min(1.0, float(np.median(here)) / (HAND_REACH * float(self.reach.max()))) if len(here) else 0.0
+
     def explained(self, silhouette: Mask) -> float:
         """Share, in [0, 1], that a silhouette explains of what is farther out than it begins, and of the thing."""
         here = self.reach[silhouette & (self.reach > 0)]
@@ -84,7 +91,7 @@ def motion_since(first: Image, others: Sequence[Image]) -> Array:
     return changed / max(len(others), 1)
 
 
-def find_object(
+def find_places(
     rgb: Image,
     moved: Array,
     meshes: Sequence[TrackingMesh],
@@ -93,9 +100,10 @@ def find_object(
     handled: bool,
     taken: Sequence[Mask] = (),
     labels: NDArray[np.uint8] | None = None,
-) -> Box | None:
-    """Box of the place that looks most like one of the meshes; None when nothing does.
+) -> list[Box]:
+    """Boxes of the places that look most like one of the meshes, best first; empty when nothing does.
 
+    All that look about as much like it as the best and lie elsewhere, PLACES at most.
     moved: from `motion_since`.  handled: the object is the one that is handled, so that it must have moved.
     taken: masks of objects found before, which cannot be found again.  labels: of a `Background`, if there is one.
     """
@@ -126,8 +134,8 @@ def find_object(
     judged.sort(key=lambda entry: entry[0], reverse=True)
 
     strength = edge_strength(rgb)
-    best_merit, best_box = LEAST_MERIT, None
-    for merit, match in _spread(judged, REFINED):
+    found: list[tuple[float, Box]] = []
+    for merit, match in _spread(judged, meshes, small_camera, REFINED):
         mesh, T = meshes[match.mesh], match.T_camera_object
         window = render_depth(mesh.vertices_m, mesh.faces, T, camera_matrix)
         if window is None or not (silhouette := window.mask_in_image(rgb.shape[1], rgb.shape[0])).any():
@@ -144,18 +152,15 @@ def find_object(
         iou, _ = silhouette_ious(mesh, T, camera_matrix, mask, box)
         size_share = np.sqrt(np.hypot(box[2], box[3]) / max(rgb.shape[:2]))
         total = merit + size_share * (iou + edge_score(mesh, T, camera_matrix, strength))
-        if total > best_merit:
-            best_merit, best_box = total, _grown(mask_box(_with_thing(silhouette, held)), 0.03, rgb)
-    return best_box
-
-
-def _with_thing(silhouette: Mask, held: Handled | None) -> Mask:
-    """A silhouette that is mostly on what is held, with what it misses of it: spouts, handles."""
-    if held is None or np.count_nonzero(held.thing & silhouette) < ON_THING * np.count_nonzero(silhouette & ~held.arm):
-        return silhouette
-    _, part = cv2.connectedComponents(held.thing.astype(np.uint8))
-    touched = np.unique(part[held.thing & silhouette])
-    return silhouette | (np.isin(part, touched) & held.thing)
+        if total > LEAST_MERIT:
+            found.append((float(total), _grown(box, 0.03, rgb)))
+    found.sort(key=lambda entry: entry[0], reverse=True)
+    boxes: list[Box] = []
+    for total, box in found:
+        near_best = total > found[0][0] - PLACES_WITHIN
+        if near_best and len(boxes) < PLACES and all(box_iou(box, other) < SAME_PLACE for other in boxes):
+            boxes.append(box)
+    return boxes
 
 
 def _soft_lab(rgb: Image) -> NDArray[np.float32]:
@@ -258,21 +263,23 @@ def _judge(
         return 1.5 * match.score + 0.5 * contrast + 0.6 * motion
     if motion < MOVED_SHARE:
         return -np.inf
-    return 1.5 * match.score + 0.5 * contrast + 0.6 * motion + EXPLAINED_WEIGHT * arm.explained(silhouette)
+    held = EXPLAINED_WEIGHT * arm.explained(silhouette) - REACHED_WEIGHT * (1.0 - arm.reached(silhouette))
+    return 1.5 * match.score + 0.5 * contrast + 0.6 * motion + held
 
 
-def _spread(judged: Sequence[tuple[float, _Match]], count: int) -> list[tuple[float, _Match]]:
-    """The best matches that are not near copies of better ones."""
+def _spread(
+    judged: Sequence[tuple[float, _Match]], meshes: Sequence[TrackingMesh], camera_matrix: Array, count: int
+) -> list[tuple[float, _Match]]:
+    """The best matches that do not fill the same part of the picture as better ones."""
     kept: list[tuple[float, _Match]] = []
+    boxes: list[Box] = []
     for merit, match in judged:
-        t = match.T_camera_object[:3, 3]
-        same = (
-            np.linalg.norm(t - other.T_camera_object[:3, 3]) < 0.05 * t[2]
-            and np.sum(match.T_camera_object[:3, 0] * other.T_camera_object[:3, 0]) > 0.8
-            for _, other in kept
-        )
-        if np.isfinite(merit) and not any(same):
+        if not np.isfinite(merit):
+            break
+        box = projected_box(camera_matrix, match.T_camera_object, meshes[match.mesh].vertices_m)
+        if box is not None and all(box_iou(box, other) < SAME_PLACE for other in boxes):
             kept.append((merit, match))
+            boxes.append(box)
         if len(kept) == count:
             break
     return kept

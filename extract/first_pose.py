@@ -20,7 +20,7 @@ from .colours import mask_evidence
 from .geometry import Array, Symmetry, make_pose, super_fibonacci_rotations, transform_points
 from .raster import render_depth
 from .region import Outline, TrackingMesh, edge_strength, extract_outline, refine
-from .segment import Box, Mask, mask_box
+from .segment import Box, Mask, box_iou, mask_box
 from .video import Image
 
 ELEVATIONS_DEG = (0.0, 8.0, 16.0, 26.0, 38.0, 52.0)
@@ -199,14 +199,7 @@ def silhouette_ious(
     either = amount(mask, np.s_[:, :]) + amount(silhouette & ~here, place)
     x, y, width, height = mask_box(silhouette)
     box = (x + place[1].start, y + place[0].start, width, height)
-    return shared / max(either, 1.0), _box_iou(box, box_xywh_px)
-
-
-def _box_iou(a: Box, b: Box) -> float:
-    width = min(a[0] + a[2], b[0] + b[2]) - max(a[0], b[0])
-    height = min(a[1] + a[3], b[1] + b[3]) - max(a[1], b[1])
-    shared = max(width, 0.0) * max(height, 0.0)
-    return shared / (a[2] * a[3] + b[2] * b[3] - shared)
+    return shared / max(either, 1.0), box_iou(box, box_xywh_px)
 
 
 def edge_score(

@@ -21,7 +21,7 @@ from .candidates import ObjectRequest as ObjectRequest
 from .candidates import candidate_models as candidate_models
 from .depth_size import sized
 from .depth_video import DepthVideo
-from .detect import find_object, motion_since
+from .detect import find_places, motion_since
 from .errors import UserError
 from .files import atomic_path
 from .focal import focal_of_clip, scaled_focal
@@ -313,27 +313,25 @@ def _find_in(
     if labels is not None:
         moved = np.array(COVERED)[labels]
     starts: list[Start] = []
+    camera = scene.camera(scene.start_scale)
     for number, (request, candidates) in enumerate(zip(requests, models, strict=True)):
         mask = None
         if followed_to is not None:
             seen = check_box(followed_to[number], info.width_px, info.height_px)
-            box, source = scaled(seen, scene.start_scale), "followed"
+            boxes, source = [scaled(seen, scene.start_scale)], "followed"
         elif request.mask is not None:
             mask = resized(read_mask(request.mask, info.width_px, info.height_px), sharp)
-            box, source = mask_box(mask), "mask"
+            boxes, source = [mask_box(mask)], "mask"
         elif request.box_xywh_px is not None:
             given = check_box(request.box_xywh_px, info.width_px, info.height_px)
-            box, source = scaled(given, scene.start_scale), "given"
+            boxes, source = [scaled(given, scene.start_scale)], "given"
         else:
-            found_box = find_object(
+            places = find_places(
                 small, moved, [m.mesh for m in candidates], scene.camera(scene.scale), labels=labels,
                 handled=len(starts) == 0, taken=[resized(s.best.mask, small) for s in starts],
             )  # fmt: skip
-            if found_box is None:
-                raise NotFoundError(f"object {request.name!r} was not found: nothing looks like it")
-            box, source = scaled(found_box, scene.start_scale / scene.scale), "found"
-        camera = scene.camera(scene.start_scale)
-        starts.append(start_object(request, candidates, sharp, box, source, camera, mask, labels))
+            boxes, source = [scaled(place, scene.start_scale / scene.scale) for place in places], "found"
+        starts.append(start_object(request, candidates, sharp, boxes, source, camera, mask, labels))
     return starts
 
 

@@ -74,6 +74,14 @@ def mask_box(mask: Mask) -> Box:
     return float(xs[0]), float(ys[0]), float(np.ptp(xs) + 1), float(np.ptp(ys) + 1)
 
 
+def box_iou(a: Box, b: Box) -> float:
+    """Intersection over union of two boxes, in [0, 1]."""
+    width = min(a[0] + a[2], b[0] + b[2]) - max(a[0], b[0])
+    height = min(a[1] + a[3], b[1] + b[3]) - max(a[1], b[1])
+    shared = max(width, 0.0) * max(height, 0.0)
+    return shared / (a[2] * a[3] + b[2] * b[3] - shared)
+
+
 def _rare_outside(rgb: Image, box: tuple[int, int, int, int]) -> Mask:
     """(h, w) pixels of the box whose colours are rare in the ring around it, by smoothed Lab histograms."""
     height, width = rgb.shape[:2]

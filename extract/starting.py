@@ -102,7 +102,7 @@ def start_object(
     request: ObjectRequest,
     candidates: Sequence[Model],
     rgb: Image,
-    box: Box,
+    boxes: Sequence[Box],
     source: str,
     camera_matrix: Array,
     mask: Mask | None = None,
@@ -110,10 +110,33 @@ def start_object(
 ) -> Start:
     """What the object may be and how it may stand in the start frame, fitted coarsely, best first.
 
-    rgb, box, camera_matrix and mask (cut from the box when None) are at the starting resolution.
+    In that one of the boxes, places where it may be, of which most is explained.
+    rgb, boxes, camera_matrix and mask (cut from the box when None) are at the starting resolution.
     labels: (H, W) of the background, at any resolution, where it is known.
     Raises NotFoundError when no pose of any candidate explains what is there.
     """
+    starts: list[Start] = []
+    refusal = NotFoundError(f"object {request.name!r} was not found: nothing looks like it")
+    for box in boxes:
+        try:
+            starts.append(_start_in(box, request, candidates, rgb, source, camera_matrix, mask, labels))
+        except NotFoundError as error:
+            refusal = error
+    if not starts:
+        raise refusal
+    return max(starts, key=lambda start: start.best.pose.merit)
+
+
+def _start_in(
+    box: Box,
+    request: ObjectRequest,
+    candidates: Sequence[Model],
+    rgb: Image,
+    source: str,
+    camera_matrix: Array,
+    mask: Mask | None,
+    labels: NDArray[np.uint8] | None,
+) -> Start:
     x, y, w, h = (round(v) for v in box)
     if rgb[y : y + h, x : x + w].std(axis=(0, 1)).max() < FLAT_GREY_LEVELS:
         raise NotFoundError(f"object {request.name!r} was not found: the frame is of one colour there")
