@@ -186,7 +186,9 @@ class MeshesFind(Command):
         from .model_folder import models_folder
         from .retrieval import Retriever
         from .scale import SizeReader
+        from .video import read_video_info
 
+        read_video_info(self.video)  # as for a picture, see `Pose`
         with Terminal() as terminal:
             store = _opened(self.db, self.encoder, self.views) if self.db else _library(terminal)
         kind: dict[str, Any] = {"level": self.level, "models_dir": self.models_dir}
@@ -279,8 +281,9 @@ class Pose(Command):
     models_dir: ModelsDir = None
 
     def do(self) -> Result:
-        from .pose_image import PictureSettings, pose_picture
+        from .pose_image import PictureSettings, pose_picture, read_picture
 
+        read_picture(self.image)  # told at once when it cannot be: the library may take minutes to make
         settings = PictureSettings(
             self.image, self.box, self.mask, self.camera, self.object, self.prompt, self.meshes, self.level,
             self.models_dir,

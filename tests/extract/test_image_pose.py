@@ -266,6 +266,17 @@ def test_a_video_finds_the_mesh_it_shows(root: Path, scene, tmp_path: Path, caps
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("words", [["pose", "gone.png", "--out", "o"], ["meshes", "find", "gone.mp4"]])
+def test_a_missing_picture_is_told_before_the_library_is_made(
+    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("VID2DEMO_LIBRARY", str(tmp_path / "library"))
+    monkeypatch.chdir(tmp_path)
+    assert main(words) == 2
+    assert "does not exist" in capsys.readouterr().err
+    assert not (tmp_path / "library").exists()
+
+
 def test_without_a_database_the_vessels_that_ship_are_one(
     scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:  # type: ignore[no-untyped-def]
