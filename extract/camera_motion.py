@@ -190,7 +190,10 @@ class CameraWatch:
         good = there & back & free & (np.linalg.norm(settled - key.start, axis=1) < ROUND_TRIP_PX)
         if good.sum() < FEWEST_CORNERS // 2:
             return lost
-        key.ids, key.start, key.now = key.ids[good], key.start[good], now[good]
+        # What has slid from frame to frame is put back by as much as it misses in the key frame: small slips all lag
+        # behind the motion, and would make a path too short.
+        key.now = (now - (settled - key.start))[good]
+        key.ids, key.start = key.ids[good], key.start[good]
         offset = np.linalg.norm(key.now - key.start, axis=1)
         still = float(np.mean(offset < STILL_PX))
         if still > STILL_SHARE and still * len(offset) >= FEWEST_CORNERS // 2:
