@@ -120,8 +120,9 @@ def mustard(data: Path, folder: Path, *, exact: bool) -> list[Row]:
     return [row, *_beside(clip / "video.mp4", box, truth, model, True)] if exact else [row]
 
 
-def coffee(data: Path, folder: Path) -> list[Row]:
-    track, row = _extracted(data / "videos/coffee_pour.mp4", ObjectRequest("kettle", KETTLE_BOX_PX), None, folder)
+def coffee(data: Path, folder: Path, *, box: bool) -> list[Row]:
+    request = ObjectRequest("kettle", KETTLE_BOX_PX if box else None)
+    track, row = _extracted(data / "videos/coffee_pour.mp4", request, None, folder)
     axis = track.T_camera_object[:, :3, 2]
     tilt_deg = np.rad2deg(np.arctan2(axis[:, 0], -axis[:, 1]))
     tilt_error = np.abs([tilt_deg[k] - by_eye for k, by_eye in TILT_BY_EYE_DEG.items()])
@@ -130,7 +131,7 @@ def coffee(data: Path, folder: Path) -> list[Row]:
     tips = np.stack([transform_points(T, tip_m[None])[0] for T in track.T_camera_object])
     tip_px = project(track.camera_matrix, tips)
     tip_error = np.array([np.linalg.norm(tip_px[k] - by_eye) for k, by_eye in TIP_BY_EYE_PX.items()])
-    row |= {"given": "the word kettle, box", "vessel": library["category"]}
+    row |= {"given": "the word kettle" + ", box" * box, "vessel": library["category"]}
     row |= {"tilt_deg": float(tilt_error.mean()), "tilt_worst_deg": float(tilt_error.max())}
     row |= {"tip_px": float(tip_error.mean()), "tip_worst_px": float(tip_error.max())}
     return [row]
@@ -167,7 +168,8 @@ def synthetic(name: str, folder: Path) -> list[Row]:
 REAL: dict[str, Callable[[Path, Path], list[Row]]] = {
     "mustard_exact": lambda data, folder: mustard(data, folder, exact=True),
     "mustard_library": lambda data, folder: mustard(data, folder, exact=False),
-    "coffee_pour": coffee,
+    "coffee_pour": lambda data, folder: coffee(data, folder, box=True),
+    "coffee_found": lambda data, folder: coffee(data, folder, box=False),
     "box_turn": box_turn,
 }
 
