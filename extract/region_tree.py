@@ -135,10 +135,10 @@ def superpixels(rgb: Image, unlike: Floats) -> Superpixels:
     seeds = np.zeros((height, width), np.int32)
     at = np.arange(rows)[:, None] * CELL_PX + calmest // CELL_PX, np.arange(columns) * CELL_PX + calmest % CELL_PX
     seeds[at] = np.arange(1, calmest.size + 1).reshape(calmest.shape)
-    flooded = cv2.watershed(picture, seeds)
-    # Watershed lines go to a neighbour; those of the picture's rim have one too.
-    beside = cv2.dilate(np.maximum(flooded, 0).astype(np.float32), np.ones((3, 3)))
-    labels = np.where(flooded < 1, beside, flooded).astype(np.int32) - 1
+    grown = np.maximum(cv2.watershed(picture, seeds), 0).astype(np.float32)
+    while not grown.all():  # watershed lines, and the picture's rim, go to a neighbour
+        grown = np.where(grown > 0, grown, cv2.dilate(grown, np.ones((3, 3))))
+    labels = grown.astype(np.int32) - 1
     count = calmest.size
     area = np.bincount(labels.ravel(), minlength=count).astype(float)
     share = np.bincount(labels.ravel(), unlike.ravel(), minlength=count) / np.maximum(area, 1)
