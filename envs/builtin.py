@@ -270,7 +270,7 @@ def reachable_grasp(vessel: Vessel, T_world_object: Array, contents_kg: float) -
         return weight_part(vessel, contents_kg, T_world_object, g.T_hand_object, g.width_m, g.is_flat)
 
     tried = 0.0
-    for most in (HOLDS, 1.4 * HOLDS, 1.9 * HOLDS, np.inf):
+    for most in (*(HOLDS * np.array([1.0, 1.2, 1.4, 1.6, 1.75, 1.9])), np.inf):
         for ways in (plain, others):
             chosen = [grasp for grasp in ways if tried < part(grasp) <= most]
             if chosen and (found := _carrying(chosen, T_world_object)) is not None:
