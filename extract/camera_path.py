@@ -4,6 +4,8 @@ From where the corners of `CameraWatch` were seen: two views with much parallax 
 matrix and, since a flat background leaves that open, by the homography as well; what explains further views best is
 taken. The other views join one after another, with bundle adjustments in between (Schoenberger and Frahm,
 Structure-from-Motion Revisited, CVPR 2016, section 4.2). The frames between the views are then placed one by one.
+
+pycolmap, given the same corners, came no nearer to the truth in more time; it is 134 MB large, this needs nothing more.
 """
 
 from __future__ import annotations
