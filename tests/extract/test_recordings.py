@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
 import pytest
 from vid2demo.extract.errors import UserError
 from vid2demo.extract.perceive import ObjectRequest, extract
+from vid2demo.extract.video import VideoWriter, iterate_frames
 
 VIDEOS = Path(__file__).parents[2].parent / "shared" / "data" / "videos"
 COFFEE, BOX_TURN = VIDEOS / "coffee_pour.mp4", VIDEOS / "box_turn.mp4"
@@ -29,12 +31,16 @@ def test_the_kettle_of_a_filmed_pour_tilts_as_read_by_eye(tmp_path: Path) -> Non
     errors_deg = np.abs([tilt_deg[frame] - by_eye for frame, by_eye in TILT_BY_EYE_DEG.items()])
     assert len(track) > max(TILT_BY_EYE_DEG)
     assert track.visible.all()
-    assert errors_deg.mean() < 6.0, errors_deg
+    assert errors_deg.mean() < 4.0, errors_deg
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 @pytest.mark.skipif(not BOX_TURN.exists(), reason=f"needs the recording {BOX_TURN}")
 def test_a_teapot_is_not_found_where_a_box_is_turned(tmp_path: Path) -> None:
+    fewer = tmp_path / "fewer.mp4"
+    with VideoWriter(fewer, 10.0) as writer:
+        for frame in islice(iterate_frames(BOX_TURN), 0, None, 3):
+            writer.write(frame.rgb)
     with pytest.raises(UserError, match="'teapot' was not found"):
-        extract(BOX_TURN, [ObjectRequest("teapot")], out=tmp_path)
+        extract(fewer, [ObjectRequest("teapot")], out=tmp_path / "out")
