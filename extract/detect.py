@@ -36,7 +36,7 @@ SOMETHING_MOVED = 0.005
 EXPLAINED_WEIGHT, REACHED_WEIGHT = 2.0, 1.0
 HAND_REACH = 0.65  # of the way from the picture's border to the farthest that moves: no sleeve goes so far
 REFINED = 8
-PLACES, PLACES_WITHIN = 3, 0.3
+PLACES, PLACES_WITHIN, REACHED_WITHIN = 3, 0.3, 0.1
 SAME_PLACE = 0.8  # of two boxes, intersection over union from which on one is as good as the other
 
 
@@ -134,7 +134,7 @@ def find_places(
     judged.sort(key=lambda entry: entry[0], reverse=True)
 
     strength = edge_strength(rgb)
-    found: list[tuple[float, Box]] = []
+    found: list[tuple[float, float, Box]] = []
     for merit, match in _spread(judged, meshes, small_camera, REFINED):
         mesh, T = meshes[match.mesh], match.T_camera_object
         window = render_depth(mesh.vertices_m, mesh.faces, T, camera_matrix)
@@ -152,12 +152,13 @@ def find_places(
         iou, _ = silhouette_ious(mesh, T, camera_matrix, mask, box)
         size_share = np.sqrt(np.hypot(box[2], box[3]) / max(rgb.shape[:2]))
         total = merit + size_share * (iou + edge_score(mesh, T, camera_matrix, strength))
+        reached = 1.0 if arm is None else arm.reached(cv2.resize(silhouette.astype(np.uint8), size) > 0)
         if total > LEAST_MERIT:
-            found.append((float(total), _grown(box, 0.03, rgb)))
+            found.append((float(total), reached, _grown(box, 0.03, rgb)))
     found.sort(key=lambda entry: entry[0], reverse=True)
     boxes: list[Box] = []
-    for total, box in found:
-        near_best = total > found[0][0] - PLACES_WITHIN
+    for total, reached, box in found:
+        near_best = total > found[0][0] - PLACES_WITHIN and reached > found[0][1] - REACHED_WITHIN
         if near_best and len(boxes) < PLACES and all(box_iou(box, other) < SAME_PLACE for other in boxes):
             boxes.append(box)
     return boxes
