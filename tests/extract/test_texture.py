@@ -95,14 +95,17 @@ def test_a_spin_that_only_the_label_shows_is_followed(can: TrackingMesh) -> None
     assert tracker.spin_source(30) == "texture"
 
 
+def seen_twice(can: TrackingMesh, exact: bool, before_deg: float) -> Texture:
+    """Texture with a key view at no spin, and then a frame at another that is none."""
+    texture = Texture(can, exact)
+    texture.keep(flattened(picture(can, pose(0), 0, label())), K, pose(0))
+    texture.keep(flattened(picture(can, pose(before_deg), 0, label())), K, pose(before_deg), key=False)
+    return texture
+
+
 def test_the_frame_before_helps_where_no_key_view_shows_that_side(can: TrackingMesh) -> None:
-    printed, turned = label(), pose(42.0)
-    found = {}
-    for exact in (True, False):
-        texture = Texture(can, exact)
-        texture.keep(flattened(picture(can, pose(0), 0, printed)), K, pose(0))
-        texture.keep(flattened(picture(can, pose(40.0), 0, printed)), K, pose(40.0), key=False)
-        found[exact] = texture.match(flattened(picture(can, turned, 1, printed)), K, pose(40.0))
+    frame = flattened(picture(can, pose(42.0), 1, label()))
+    found = {exact: seen_twice(can, exact, 40.0).match(frame, K, pose(40.0)) for exact in (True, False)}
     assert len(found[True]) == 0
     assert len(found[False]) > 25
     # What moves as the frame before does not tell that the pose is right.
@@ -110,13 +113,10 @@ def test_the_frame_before_helps_where_no_key_view_shows_that_side(can: TrackingM
 
 
 def test_views_turned_away_count_less_when_the_mesh_is_only_like_the_object(can: TrackingMesh) -> None:
-    printed, turned = label(), pose(15.0)
+    frame = flattened(picture(can, pose(15.0), 1, label()))
     weights = {}
     for exact in (True, False):
-        texture = Texture(can, exact)
-        texture.keep(flattened(picture(can, pose(0), 0, printed)), K, pose(0))
-        texture.keep(flattened(picture(can, pose(13.0), 0, printed)), K, pose(13.0), key=False)
-        found = texture.match(flattened(picture(can, turned, 1, printed)), K, turned)
+        found = seen_twice(can, exact, 13.0).match(frame, K, pose(15.0))
         assert found.keyed.any()
         weights[exact] = found.points.weight[found.keyed].mean()
         if not exact:
