@@ -163,6 +163,13 @@ def _gain(rgb: Image, reference: Image, known: NDArray[np.bool_]) -> Array:
 
 
 @numba.njit(cache=True)
+def _near(colour: NDArray[np.int32], k: int, j: int, same: float) -> bool:
+    """Whether two of the colours (K, 3) differ by less than `same` in every channel."""
+    red, green, blue = colour[k, 0] - colour[j, 0], colour[k, 1] - colour[j, 1], colour[k, 2] - colour[j, 2]
+    return bool(max(abs(red), abs(green), abs(blue)) < same)
+
+
+@numba.njit(cache=True)
 def _two_modes(
     stack: NDArray[np.uint8], same: float
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.float32]]:
@@ -170,43 +177,46 @@ def _two_modes(
     count, h, w, _ = stack.shape
     modes = np.zeros((2, h, w, 3), np.uint8)
     share, when = np.zeros((2, h, w), np.float32), np.zeros((2, h, w), np.float32)
-    taken = np.zeros(count, np.bool_)
+    colour, index = np.empty((count, 3), np.int32), np.empty(count, np.int32)  # of what belongs to no mode yet
+    near, total = np.empty(count, np.bool_), np.empty(3, np.int32)
     for y in range(h):
         for x in range(w):
-            taken[:] = False
+            left = count
+            for k in range(count):
+                index[k] = k
+                for c in range(3):
+                    colour[k, c] = stack[k, y, x, c]
             for m in range(2):
                 best, best_k = 0, -1
-                for k in range(count):
-                    if taken[k]:
-                        continue
+                for k in range(left):
                     agree = 0
-                    for j in range(count):
-                        if not taken[j]:
-                            d = 0.0
-                            for c in range(3):
-                                d = max(d, abs(float(stack[k, y, x, c]) - float(stack[j, y, x, c])))
-                            agree += d < same
+                    for j in range(left):
+                        agree += _near(colour, k, j, same)
                     if agree > best:
                         best, best_k = agree, k
-                if best_k < 0:
+                    if best == left:
+                        break  # as nearly everywhere: what stands still shows one colour
+                if best == 0:
                     break
-                total, at, n = np.zeros(3), 0.0, 0
-                for j in range(count):
-                    if not taken[j]:
-                        d = 0.0
-                        for c in range(3):
-                            d = max(d, abs(float(stack[best_k, y, x, c]) - float(stack[j, y, x, c])))
-                        if d < same:
-                            n += 1
-                            at += j
-                            for c in range(3):
-                                total[c] += stack[j, y, x, c]
-                            if j != best_k:
-                                taken[j] = True
-                taken[best_k] = True
+                total[:] = 0
+                at, rest = 0, 0
+                for j in range(left):
+                    near[j] = _near(colour, best_k, j, same)
+                for j in range(left):
+                    if near[j]:
+                        at += index[j]
+                    else:
+                        index[rest] = index[j]
+                    for c in range(3):
+                        if near[j]:
+                            total[c] += colour[j, c]
+                        else:
+                            colour[rest, c] = colour[j, c]
+                    rest += not near[j]
                 for c in range(3):
-                    modes[m, y, x, c] = np.uint8(total[c] / n + 0.5)
-                share[m, y, x], when[m, y, x] = n / count, at / n
+                    modes[m, y, x, c] = np.uint8(total[c] / best + 0.5)
+                share[m, y, x], when[m, y, x] = best / count, at / best
+                left = rest
     return modes, share, when
 
 
