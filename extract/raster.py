@@ -12,7 +12,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from .geometry import Array, project, transform_points
+from .geometry import Array, extent, project, transform_points
 
 FAR_M = np.float32(1e30)  # of pixels where nothing was drawn yet
 
@@ -81,8 +81,9 @@ def render_depth(
     if points[:, 2].min() < 1e-3:
         return None
     pixels = project(camera_matrix, points)
-    low = np.floor(pixels.min(axis=0)).astype(int) - margin_px
-    size = np.ceil(pixels.max(axis=0)).astype(int) + margin_px + 1 - low
+    lowest, highest = extent(pixels)
+    low = np.floor(lowest).astype(int) - margin_px
+    size = np.ceil(highest).astype(int) + margin_px + 1 - low
     if size.max() > max_side_px:
         return None
     depth = np.empty((size[1], size[0]), np.float32)

@@ -126,7 +126,9 @@ class Points:
 def edge_strength(rgb: Image) -> NDArray[np.float32]:
     """(H, W, 2) image gradient, the largest of the three channels, scaled so that a clear edge has length 1."""
     strength = np.empty((*rgb.shape[:2], 2), np.float32)
-    strongest_gradient(np.asarray(cv2.GaussianBlur(rgb, (0, 0), 1.0), np.uint8), 1 / (8 * CLEAR_EDGE), strength)
+    soft = cv2.GaussianBlur(rgb, (0, 0), 1.0)
+    gx, gy = (np.asarray(cv2.Sobel(soft, cv2.CV_16S, dx, 1 - dx), np.int16) for dx in (1, 0))
+    strongest_gradient(gx, gy, 1 / (8 * CLEAR_EDGE), strength)
     return strength
 
 
@@ -281,6 +283,7 @@ def refine(
     points = points or Points.none()
     score, count, strain = -np.inf, 0, 0.0
     information: Array = np.zeros((6, 6))
+    told = bins != HIDDEN_BIN
     up = T_start[:3, :3] @ np.asarray(spin_axis)
     prior = _prior(T_start, up, prior_rotation_rad, prior_spin_rad, prior_translation, prior_depth)
 
@@ -289,7 +292,7 @@ def refine(
         found = np.zeros((6, 6))
         point, target, normal = lines.outline.point_object_m, lines.target_px, lines.outline.normal
         if edges is not None and outline is not None and outline.creases is not None:
-            inner = outline.creases.read(T, camera_matrix, edges, lines.step_px, bins != HIDDEN_BIN)
+            inner = outline.creases.read(T, camera_matrix, edges, lines.step_px, told)
             point, target, normal = (np.concatenate(pair) for pair in zip((point, target, normal), inner, strict=False))
             inverse_variance = np.concatenate([inverse_variance, CREASE_WEIGHT / inner[3]])
         cost = solve_pose(

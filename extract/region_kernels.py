@@ -63,22 +63,20 @@ def count_bins(lab: NDArray[np.uint8], bits: int, chroma_step: int, bins: NDArra
 
 
 @numba.njit(cache=True)
-def strongest_gradient(rgb: NDArray[np.uint8], scale: float, out: NDArray[np.float32]) -> None:
-    """Sobel gradient times `scale` of the channel where it is longest, (H, W, 2); 0 at the image's border."""
-    h, w = rgb.shape[:2]
-    out[:] = 0.0
-    for y in range(1, h - 1):
-        for x in range(1, w - 1):
-            best = -1
+def strongest_gradient(gx: NDArray[np.int16], gy: NDArray[np.int16], scale: float, out: NDArray[np.float32]) -> None:
+    """The gradient times `scale` of the channel where it is longest, (H, W, 2); 0 at the image's border.
+
+    gx, gy: (H, W, 3) differences along x and y, such as Sobel's.
+    """
+    for y in range(gx.shape[0]):
+        for x in range(gx.shape[1]):
+            best, k = -1, 0
             for c in range(3):
-                nw, ne = np.int32(rgb[y - 1, x - 1, c]), np.int32(rgb[y - 1, x + 1, c])
-                sw, se = np.int32(rgb[y + 1, x - 1, c]), np.int32(rgb[y + 1, x + 1, c])
-                gx = ne + se - nw - sw + 2 * (np.int32(rgb[y, x + 1, c]) - np.int32(rgb[y, x - 1, c]))
-                gy = sw + se - nw - ne + 2 * (np.int32(rgb[y + 1, x, c]) - np.int32(rgb[y - 1, x, c]))
-                square = int(gx * gx + gy * gy)
+                square = gx[y, x, c] * gx[y, x, c] + gy[y, x, c] * gy[y, x, c]
                 if square > best:
-                    best = square
-                    out[y, x, 0], out[y, x, 1] = gx * scale, gy * scale
+                    best, k = square, c
+            out[y, x, 0], out[y, x, 1] = gx[y, x, k] * scale, gy[y, x, k] * scale
+    out[0], out[-1], out[:, 0], out[:, -1] = 0.0, 0.0, 0.0, 0.0
 
 
 @numba.njit(cache=True)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from .colours import ColourModel
-from .geometry import Array, pose_change, project, transform_points
+from .geometry import Array, extent, pose_change, project, transform_points
 from .raster import render_depth
 from .region import Lines, TrackingMesh, measure
 from .segment import Box
@@ -183,8 +183,7 @@ def _box_rows(
 
 
 def _projected_sides(mesh: Surface | TrackingMesh, T: Array, camera_matrix: Array) -> Array:
-    pixels = project(camera_matrix, transform_points(T, mesh.vertices_m))
-    return np.concatenate([pixels.min(axis=0), pixels.max(axis=0)])
+    return np.concatenate(extent(project(camera_matrix, transform_points(T, mesh.vertices_m))))
 
 
 def _signed_distance(mesh: Surface | TrackingMesh, T: Array, camera_matrix: Array, pixel: Array) -> Array:

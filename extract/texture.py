@@ -182,16 +182,23 @@ def _matched(
         depth.depth_m, depth.x0_px, depth.y0_px, camera_matrix, view.T_camera_object @ invert_pose(T),
         view.depth.depth_m, view.depth.x0_px, view.depth.y0_px, view.picture, view.camera_matrix, drawn, covered,
     )  # fmt: skip
-    inner = cv2.erode(covered, np.ones((2 * ERODE_PX + 1,) * 2, np.uint8))
-    corners: NDArray[Any] | None = cv2.goodFeaturesToTrack(drawn, CORNERS, 0.02, 4, mask=inner, blockSize=5)
-    if corners is None:
+    if not covered.any():
         return np.zeros((0, 3)), np.zeros((0, 2))
+    # Corners and contrast are looked for where something was drawn, and as far around it as they are told by.
+    h, w = depth.depth_m.shape
+    x0, y0 = max(depth.x0_px - PATCH_PX, 0), max(depth.y0_px - PATCH_PX, 0)
+    around = np.s_[y0 : max(depth.y0_px + h + PATCH_PX, 0), x0 : max(depth.x0_px + w + PATCH_PX, 0)]
+    inner = cv2.erode(covered[around], np.ones((2 * ERODE_PX + 1,) * 2, np.uint8))
+    found: NDArray[Any] | None = cv2.goodFeaturesToTrack(drawn[around], CORNERS, 0.02, 4, mask=inner, blockSize=5)
+    if found is None:
+        return np.zeros((0, 3)), np.zeros((0, 2))
+    corners = found + np.array([x0, y0], np.float32)
     there, ok, unlike = _flow(drawn, picture, corners)
     back, ok_back, _ = _flow(picture, drawn, there)
     near = np.linalg.norm(back - corners, axis=2)[:, 0] < FORTH_AND_BACK_PX
     # Sensor noise has corners as well, and flow that stays where it is: only patches that look alike are matches.
     x, y = np.round(corners[:, 0]).astype(int).T
-    contrast = cv2.blur(np.abs(drawn.astype(np.float32) - 128), (PATCH_PX, PATCH_PX))[y, x]
+    contrast = cv2.blur(np.abs(drawn[around].astype(np.float32) - 128), (PATCH_PX, PATCH_PX))[y - y0, x - x0]
     good = near & (ok[:, 0] > 0) & (ok_back[:, 0] > 0) & (unlike[:, 0] < ALIKE * contrast)
     corners, there, x, y = corners[good, 0].astype(float), there[good, 0].astype(float), x[good], y[good]
     z = depth.depth_m[y - depth.y0_px, x - depth.x0_px].astype(float)

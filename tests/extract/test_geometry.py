@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from vid2demo.extract.geometry import (
     Symmetry,
+    extent,
     focal_prior_camera_matrix,
     invert_pose,
     look_at,
@@ -100,3 +101,10 @@ def test_a_point_is_seen_where_a_picture_made_smaller_or_larger_shows_it(scale: 
     rows, columns = np.indices(resized.shape)
     centre = np.array([(columns * resized).sum(), (rows * resized).sum()]) / resized.sum()
     np.testing.assert_allclose(project(scaled_camera(camera, scale), point)[0], centre, atol=0.03)
+
+
+def test_the_extent_of_points_is_the_box_around_them() -> None:
+    points = np.random.default_rng(2).normal(size=(40, 3))
+    low, high = extent(points)
+    assert np.array_equal(low, points.min(axis=0))
+    assert np.array_equal(high, points.max(axis=0))

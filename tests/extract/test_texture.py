@@ -135,6 +135,16 @@ def test_nothing_is_matched_where_a_frame_does_not_show_the_object(can: Tracking
     assert found.points.pixel[:, 0].max() < WIDTH // 2 + 2
 
 
+@pytest.mark.parametrize(("x_m", "shows"), [(-0.4, False), (-0.15, True), (0.15, True), (0.4, False)])
+def test_an_object_at_the_border_is_matched_where_it_shows(can: TrackingMesh, x_m: float, shows: bool) -> None:
+    texture, printed = Texture(can), label()
+    texture.keep(flattened(picture(can, pose(0, x_m=0.98 * x_m), 0, printed)), K, pose(0, x_m=0.98 * x_m))
+    found = texture.match(flattened(picture(can, pose(0, x_m=x_m), 1, printed)), K, pose(0, x_m=0.99 * x_m))
+    assert (len(found) > 12) == shows
+    if shows:
+        assert found.points.errors_px(pose(0, x_m=x_m), K).max() < 3
+
+
 def test_a_spin_that_nothing_shows_is_not_invented(can: TrackingMesh) -> None:
     tracker = tracker_at(can, pose(0), None)
     for k in range(1, 21):
