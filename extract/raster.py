@@ -72,10 +72,13 @@ def render_depth(
     *,
     margin_px: int = 2,
     max_side_px: int = 2000,
+    closed: bool = False,
 ) -> DepthWindow | None:
     """Depth of a triangle mesh seen by a pinhole camera; None when it is behind the camera or absurdly large.
 
     vertices_m: (V, 3) in the object frame.  faces: (F, 3).  The window fits the projection plus `margin_px`.
+    closed: the faces are known to be closed surfaces, counter-clockwise seen from outside, so that those that look
+    away need not be drawn.
     """
     points = transform_points(T_camera_object, vertices_m)
     if points[:, 2].min() < 1e-3:
@@ -87,12 +90,12 @@ def render_depth(
     if size.max() > max_side_px:
         return None
     depth = np.empty((size[1], size[0]), np.float32)
-    _fill(pixels - low, points[:, 2], faces, depth)
+    _fill(pixels - low, points[:, 2], faces, closed, depth)
     return DepthWindow(depth, int(low[0]), int(low[1]))
 
 
 @numba.njit(cache=True, fastmath=True)
-def _fill(uv: Array, z: Array, faces: NDArray[np.int32], depth: NDArray[np.float32]) -> None:
+def _fill(uv: Array, z: Array, faces: NDArray[np.int32], closed: bool, depth: NDArray[np.float32]) -> None:
     """Z-buffer with 1/z interpolated linearly on the image plane, which is exact for planes in perspective."""
     h, w = depth.shape
     depth[:] = FAR_M
@@ -101,7 +104,7 @@ def _fill(uv: Array, z: Array, faces: NDArray[np.int32], depth: NDArray[np.float
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
         ax, ay, bx, by, cx, cy = uv[a, 0], uv[a, 1], uv[b, 0], uv[b, 1], uv[c, 0], uv[c, 1]
         area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
-        if abs(area) < 1e-12:
+        if abs(area) < 1e-12 or (closed and area > 0.0):
             continue
         x_a = max(int(np.ceil(min(ax, bx, cx))), 0)
         x_b = min(int(np.floor(max(ax, bx, cx))), w - 1)

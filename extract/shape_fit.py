@@ -188,7 +188,7 @@ def _projected_sides(mesh: Surface | TrackingMesh, T: Array, camera_matrix: Arra
 
 def _signed_distance(mesh: Surface | TrackingMesh, T: Array, camera_matrix: Array, pixel: Array) -> Array:
     """Distance of pixels (N, 2) from the silhouette's outline in px, positive outside, limited to +-20."""
-    window = render_depth(mesh.vertices_m, mesh.faces, T, camera_matrix, margin_px=24)
+    window = render_depth(mesh.vertices_m, mesh.faces, T, camera_matrix, margin_px=24, closed=True)
     if window is None:
         return np.zeros(len(pixel))
     filled = window.mask.astype(np.uint8)

@@ -22,6 +22,7 @@ from .vessel_shapes import (
     cumulative_share,
     eroded,
     lofted,
+    remembered,
     resampled,
     round_off,
     rounded_path,
@@ -41,7 +42,7 @@ PROFILE_TOLERANCE_M = 1e-4
 LIP_LEVELS: Array = np.linspace(0.1, 1.0, 9, dtype=np.float64)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Walls:
     """Outer and inner profile (z, r) of a vessel's wall in the body frame, and what its cross-section is.
 
@@ -103,6 +104,7 @@ class Draft:
     inside_rgba: Color | None = None
 
 
+@remembered
 def round_walls(
     outer: Array,
     wall_m: float,
@@ -207,6 +209,7 @@ def spout(
     return Part(solid, rgba), Part(channel, rgba), outlet
 
 
+@remembered
 def _from_inside(walls: Walls, path: Array, half_m: float) -> tuple[Array, Array]:
     """The path (K, 2) from where a tube of radius half_m leaves the cavity; and where its middle crosses the wall."""
     fine = resampled(path, 0.0005)
@@ -380,7 +383,7 @@ def assemble(category: str, params: Mapping[str, float], draft: Draft, whole: Jo
 
 
 def outline_surfaces(draft: Draft) -> tuple[Array, NDArray[np.int32]]:
-    """Vertices (V, 3) in m and faces (F, 3) with the vessel's silhouette, in its frame.
+    """Vertices (V, 3) in m and faces (F, 3) of closed surfaces with the vessel's silhouette, in its frame.
 
     Dents and cuts lie inside the silhouette and are left out, and the parts lie in one another instead of being
     joined and hollowed out. That takes a tenth of the time, for fits that draw hundreds of shapes.

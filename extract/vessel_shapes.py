@@ -9,8 +9,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
-from typing import TypeAlias
+from functools import cached_property, lru_cache, wraps
+from typing import Any, TypeAlias
 
 import manifold3d
 import numpy as np
@@ -25,6 +25,45 @@ Solid: TypeAlias = manifold3d.Manifold  # noqa: UP040
 
 SEGMENTS = 64
 TUBE_SEGMENTS = 24
+KEPT = 128  # latest results of every function that is `remembered`
+
+
+def remembered[**P, R](make: Callable[P, R]) -> Callable[P, R]:
+    """A function that keeps its latest results by its arguments, arrays by what is in them.
+
+    A fit changes one parameter of a vessel at a time, which leaves most of its parts as they were. Results are
+    shared: none may be written to.
+    """
+
+    @lru_cache(KEPT)
+    def kept(arguments: _Arguments) -> R:
+        return make(*arguments.positional, **arguments.named)
+
+    @wraps(make)
+    def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
+        return kept(_Arguments(args, kwargs))
+
+    return wrapper
+
+
+class _Arguments:
+    """Arguments of a call, equal to others of the same values."""
+
+    def __init__(self, positional: tuple[Any, ...], named: dict[str, Any]) -> None:
+        self.positional, self.named = positional, named
+        self._values = _hashable((positional, tuple(named.items())))
+
+    def __hash__(self) -> int:
+        return hash(self._values)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Arguments) and self._values == other._values
+
+
+def _hashable(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return value.shape, value.tobytes()
+    return tuple(map(_hashable, value)) if isinstance(value, (tuple, list)) else value
 
 
 @dataclass(frozen=True)
@@ -74,6 +113,7 @@ class Lip:
         return float(np.trapezoid(area, z))
 
 
+@remembered
 def rounded_path(points: Array, fillet_m: float | Sequence[float], steps: int = 8) -> Array:
     """A polyline (K, D) with its inner corners replaced by circular arcs of radius `fillet_m` (one or K-2 values).
 
@@ -109,6 +149,7 @@ def rounded_path(points: Array, fillet_m: float | Sequence[float], steps: int = 
     return np.asarray(kept)
 
 
+@remembered
 def smooth_profile(knots: Sequence[tuple[float, float]], count: int = 80) -> Array:
     """(count, 2) monotone-per-piece smooth curve (z, r) through knots with ascending z."""
     z, r = np.asarray(knots, float).T
@@ -220,6 +261,7 @@ def _stacked_faces(levels: int, n: int) -> NDArray[np.int32]:
     return faces
 
 
+@remembered
 def lofted(
     profile: Array,
     corner: Array | None = None,
@@ -248,6 +290,7 @@ def lofted(
     return stacked_rings(np.concatenate([xy, np.broadcast_to(z[:, None, None], (*xy.shape[:2], 1))], axis=-1))
 
 
+@remembered
 def tube(path: Array, half_m: Array | float, half_y_m: Array | float | None = None, *, dome: float = 0.0) -> Shape:
     """Tube along a path (K, 2) of (x, z) in the symmetry plane, of elliptic cross-section.
 

@@ -14,7 +14,7 @@ from vid2demo.extract.geometry import focal_prior_camera_matrix, make_pose
 from vid2demo.extract.meshes import load_mesh, mesh_sha256
 from vid2demo.extract.raster import render_depth
 from vid2demo.extract.vessel_output import contact_sheet, export_vessel, library_table
-from vid2demo.extract.vessel_shapes import Solid, stacked_rings
+from vid2demo.extract.vessel_shapes import Solid, remembered, stacked_rings
 from vid2demo.extract.vessel_types import Profile, Section
 from vid2demo.extract.vessels import (
     CATEGORIES,
@@ -379,3 +379,26 @@ def test_outline_mesh_has_the_silhouette_of_the_vessel(category: str) -> None:
         T = make_pose(upright_rotation(elevation, yaw, roll), (0.0, 0.0, 0.8))
         a, b = (render_depth(v, f, T, camera).mask_in_image(320, 240) for v, f in meshes)
         assert np.count_nonzero(a & b) / np.count_nonzero(a | b) > 0.995
+        vertices, faces = meshes[1]
+        whole = render_depth(vertices, faces, T, camera)
+        front = render_depth(vertices, faces, T, camera, closed=True)
+        assert np.array_equal(whole.mask, front.mask)
+
+
+def test_what_is_remembered_is_told_apart_by_the_values_of_all_arguments() -> None:
+    calls = []
+
+    @remembered
+    def scaled(points: np.ndarray, by: float = 1.0) -> np.ndarray:
+        calls.append(by)
+        return points * by
+
+    points = np.arange(6.0)
+    first = scaled(points.reshape(2, 3), by=2.0)
+    assert scaled(points.reshape(2, 3).copy(), by=2.0) is first
+    assert len(calls) == 1
+    for other, by in ((points.reshape(3, 2), 2.0), (points.reshape(2, 3), 3.0), (points.reshape(2, 3) + 1e-12, 2.0)):
+        assert np.array_equal(scaled(other, by=by), other * by)
+    points[:] = 7.0
+    assert np.array_equal(scaled(points, by=2.0), points * 2)
+    assert len(calls) == 5
