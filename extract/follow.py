@@ -148,6 +148,11 @@ class Followed:
         )  # fmt: skip
 
     @property
+    def sure(self) -> float:
+        """Mean confidence over the clip, nothing where it is not in view."""
+        return float(np.mean([e.confidence * e.visible for e in self.estimates]))
+
+    @property
     def spin_source(self) -> str:
         """What told the object's turns about its own axis: "texture", "outline" or "none"."""
         return self.tracker.spin_source(len(self.estimates))

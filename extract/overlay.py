@@ -31,7 +31,7 @@ class OverlayItem:
 def write_overlay(video: Path, items: Sequence[OverlayItem], out: Path, max_side_px: int = 960) -> None:
     """Write a video with the outline, axes, trail and confidence of every track drawn over the frames."""
     info = read_video_info(video)
-    with VideoWriter(out, info.fps) as writer:
+    with VideoWriter(out, info.fps, preset="ultrafast") as writer:
         for frame in iterate_frames(video, max_side_px):
             image = frame.rgb.copy()
             scale = image.shape[1] / info.width_px
@@ -50,7 +50,7 @@ def draw_track(image: Image, item: OverlayItem, index: int, scale: float, colour
     window = render_depth(item.mesh.vertices_m, item.mesh.faces, T, K)
     if window is not None and visible:
         silhouette = window.mask_in_image(width, height).astype(np.uint8)
-        contours, _ = cv2.findContours(silhouette, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+        contours, _ = cv2.findContours(silhouette, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_TC89_L1)
         cv2.drawContours(image, contours, -1, (255, 255, 255), 3, cv2.LINE_AA)
         cv2.drawContours(image, contours, -1, colour, 2, cv2.LINE_AA)
         _draw_axes(image, T, K, 0.6 * item.mesh.radius_m)

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from .background import COVERED, SAMPLES, Background, learn_background
-from .both_ways import Clip, Watched, follow_both_ways, settle_rivals
+from .both_ways import Clip, Watched, follow_both_ways, look_again, settle_rivals
 from .camera_of_tracks import with_camera
 from .candidates import Model, vessel_model
 from .candidates import ObjectRequest as ObjectRequest
@@ -138,6 +138,8 @@ def extract(
         again = _from_elsewhere(best, requests, models, report, camera_motion != "static")
         if again is not None and again.sure > best.sure + ELSEWHERE_MARGIN:
             best = again
+    clip = _clip(scene, best.index, best.sharp)
+    best = replace(best, followed=look_again(clip, best.followed, best.watched, report))
     camera_told: dict[str, Any] = {"source": camera_source}
     if camera is None and requests[0].mesh is not None:
         best, camera_told = _with_told_focal(best, requests, models, report, camera_motion != "static")
@@ -196,12 +198,16 @@ def write_tracks(
 def _attempt(
     scene: _Scene, index: int, sharp: Image, starts: list[Start], report: Progress, watch_camera: bool
 ) -> _Attempt:
-    clip = Clip(scene.info, index, _small(sharp, scene), scene.camera(scene.scale), scene.background, scene.depth)
+    clip = _clip(scene, index, sharp)
     near = clip.depth_of(index)
     starts = settle_rivals(clip, [sized(start, near) for start in starts])
     starts = [sized(sharpened(start, sharp, scene.camera(scene.start_scale)), near) for start in starts]
     followed, watched = follow_both_ways(clip, starts, report, watch_camera=watch_camera)
     return _Attempt(scene, sharp, index, starts, followed, watched)
+
+
+def _clip(scene: _Scene, index: int, sharp: Image) -> Clip:
+    return Clip(scene.info, index, _small(sharp, scene), scene.camera(scene.scale), scene.background, scene.depth)
 
 
 def _from_elsewhere(

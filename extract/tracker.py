@@ -172,7 +172,8 @@ class ObjectTracker:
         start = ahead if guess is None else guess
         part = self._around(rgb, start)
         best = self._fitted(part, start, spin=0.02 if guess is None else HELD_SPIN_RAD)
-        if guess is not None and self._lost_frames == 0 and self._differ(ahead, guess):
+        beatable = best.merit < 1.0 - GUESS_MARGIN
+        if guess is not None and beatable and self._lost_frames == 0 and self._differ(ahead, guess):
             # A guess from a first look that went astray is given up for where the second look has come.
             other_part = self._around(rgb, ahead)
             other = self._fitted(other_part, ahead, spin=HELD_SPIN_RAD)

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from vid2demo.extract.both_ways import Clip, follow_both_ways, look_again
+from vid2demo.extract.candidates import vessel_model
 from vid2demo.extract.colours import ColourModel, colour_bins, mask_evidence
 from vid2demo.extract.errors import UserError
-from vid2demo.extract.first_pose import find_first_pose, upright_rotation
+from vid2demo.extract.first_pose import PoseCandidate, find_first_pose, upright_rotation
 from vid2demo.extract.follow import Followed
 from vid2demo.extract.geometry import (
     focal_prior_camera_matrix,
@@ -25,9 +28,10 @@ from vid2demo.extract.segment import check_box, mask_box, mask_from_box, mask_fr
 from vid2demo.extract.shape_fit import View, fit_shape, tracking_mesh
 from vid2demo.extract.smoothing import smooth_poses
 from vid2demo.extract.spin import spun
+from vid2demo.extract.starting import Hypothesis, Start
 from vid2demo.extract.tracker import ObjectTracker
 from vid2demo.extract.vessels import make_vessel
-from vid2demo.extract.video import VideoWriter
+from vid2demo.extract.video import VideoWriter, read_video_info
 
 WIDTH, HEIGHT = 320, 240
 K = focal_prior_camera_matrix(WIDTH, HEIGHT)
@@ -310,6 +314,33 @@ def test_extract_writes_a_track_that_hugs_the_object(clip: Path, mesh, tmp_path:
     assert done[-1] == (12, 12)
     again = extract(clip, [ObjectRequest("mug", box)], out=tmp_path / "again")["mug"]
     assert np.array_equal(again.T_camera_object, track.T_camera_object)
+
+
+def test_what_is_not_followed_surely_is_looked_at_again_and_the_surer_kept(
+    clip: Path, mug, mesh, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    narrow = make_vessel("mug", None, **{**mug.params, "top_radius_m": 0.7 * mug.params["top_radius_m"]})
+    mask, T = silhouette(mesh, moving_pose(0)), moving_pose(0)
+    box = mask_box(mask)
+    start = Start((Hypothesis(vessel_model(narrow), PoseCandidate(T, 1.0, 1.0), mask, box, mask),), "given", box)
+    film = Clip(read_video_info(clip), 0, picture(mesh, T, seed=0), K)
+    with monkeypatch.context() as first:
+        first.setattr("vid2demo.extract.follow.FIT_STEPS_PX", ())  # the shape stays wrong
+        done, watched = follow_both_ways(film, [start], lambda *_: None)
+
+    monkeypatch.setattr("vid2demo.extract.both_ways.SURE_ENOUGH", 0.0)
+    assert look_again(film, done, watched, lambda *_: None) == done
+    monkeypatch.setattr("vid2demo.extract.both_ways.SURE_ENOUGH", 1.1)  # nothing is
+    (again,) = look_again(film, done, watched, lambda *_: None)
+
+    assert again.sure > done[0].sure
+
+    def astray(self: Followed, rgb: np.ndarray) -> Followed:
+        poses = np.stack([spun(e.T_camera_object, 0.5) for e in self.estimates])
+        return replace(self, guesses=poses, vessel=narrow, mesh=vessel_model(narrow).mesh)
+
+    monkeypatch.setattr(Followed, "second_pass", astray)
+    assert look_again(film, done, watched, lambda *_: None) == done
 
 
 def test_bad_requests_are_one_clear_error(clip: Path, tmp_path: Path) -> None:
