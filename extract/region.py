@@ -138,9 +138,10 @@ def extract_outline(
     camera_matrix: Array,
     image_shape: tuple[int, int],
     count: int = 300,
+    with_creases: bool = True,
 ) -> Outline | None:
     """Sample the silhouette's outer boundary inside the image; None when the object cannot be drawn."""
-    outline = draw_outline(mesh, T_camera_object, camera_matrix, count)
+    outline = draw_outline(mesh, T_camera_object, camera_matrix, count, with_creases)
     return None if outline is None else outline.inside(image_shape)
 
 
@@ -217,7 +218,8 @@ def measure(
     outline: Outline | None = None,
 ) -> Lines | None:
     """Read every line of the outline at one pose, drawn anew if not given; None when fewer than 12 are usable."""
-    outline = outline or extract_outline(mesh, T_camera_object, camera_matrix, (bins.shape[0], bins.shape[1]))
+    shape = (bins.shape[0], bins.shape[1])
+    outline = outline or extract_outline(mesh, T_camera_object, camera_matrix, shape, with_creases=False)
     if outline is None:
         return None
     mean_px, variance, gain = np.zeros(len(outline)), np.zeros(len(outline)), np.zeros(len(outline))
