@@ -179,10 +179,12 @@ class ObjectTracker:
             other = self._fitted(other_part, ahead, spin=HELD_SPIN_RAD)
             if other.merit > best.merit + GUESS_MARGIN:
                 part, best = other_part, other
+        leapt = False
         if best.on_surface < ON_SURFACE:
             # An outline leans toward the camera as well as away from it: depth knows better.
             other = self._fitted(part, mirrored(best.T_camera_object), spin=HELD_SPIN_RAD)
-            best = other if other.merit > best.merit + GUESS_MARGIN else best
+            if other.merit > best.merit + GUESS_MARGIN:
+                best, leapt = other, True
         if best.confidence < LOST_BELOW:
             part = self._part(rgb, 0, 0, rgb.shape[1], rgb.shape[0])
             best = self._searched(part, best, start)
@@ -193,6 +195,8 @@ class ObjectTracker:
                 self._pose, self._velocity = start, VELOCITY_KEPT * self._velocity
             return Estimate(start, best.confidence, False)
         self._accept(best, part)
+        if leapt:
+            self._velocity = np.zeros(6)  # it did not move like that
         return Estimate(best.T_camera_object, best.confidence, True)
 
     def _differ(self, one: Array, other: Array) -> bool:

@@ -13,10 +13,12 @@ from vid2demo.extract.depth_size import scaled_vessel, size_of_clip
 from vid2demo.extract.depth_term import Surface, draw_surface, settle, size_told
 from vid2demo.extract.depth_video import DepthVideo, DepthView
 from vid2demo.extract.errors import UserError
+from vid2demo.extract.first_pose import upright_rotation
 from vid2demo.extract.geometry import focal_prior_camera_matrix, make_pose, transform_points
 from vid2demo.extract.raster import render_depth
 from vid2demo.extract.region import TrackingMesh
 from vid2demo.extract.shape_fit import tracking_mesh
+from vid2demo.extract.spin import mirrored
 from vid2demo.extract.steps import ObjectSettings, VideoSettings
 from vid2demo.extract.synthetic_depth import sensed_depth
 from vid2demo.extract.tracker import ObjectTracker
@@ -147,6 +149,25 @@ def test_a_body_of_revolution_keeps_the_spin_it_had() -> None:
     assert T is not None
     turn = Rotation.from_matrix(truth[:3, :3].T @ T[:3, :3]).as_rotvec()
     assert abs(turn[2]) < np.deg2rad(0.3)
+
+
+def test_a_pose_that_leans_the_wrong_way_is_put_right_without_a_motion_of_its_own() -> None:
+    bottle = make_vessel("bottle")
+    mesh = tracking_mesh(bottle)
+    truth = make_pose(upright_rotation(-28, 0, 20), (0.0, 0.0, 0.9))
+    window = render_depth(mesh.vertices_m, mesh.faces, truth, K)
+    assert window is not None
+    shown = window.mask_in_image(WIDTH, HEIGHT)
+    picture = np.where(shown[..., None], (170, 60, 50), GROUND).clip(0, 255).astype(np.uint8)
+    view = DepthView(np.where(shown, window.depth_in_image(WIDTH, HEIGHT), 1.4), K)
+    tracker = ObjectTracker(mesh, K, picture, shown, mirrored(truth), bottle.symmetry, exact=False)
+    found = tracker.step(picture, depth=view)
+    # Nothing there: the pose is where the motion leads, and being put right is no motion.
+    lost = tracker.step(GROUND.clip(0, 255).astype(np.uint8))
+    assert found.visible
+    assert not lost.visible
+    for T in (found.T_camera_object, lost.T_camera_object):
+        assert np.rad2deg(np.arccos(T[:3, 2] @ truth[:3, 2])) < 8
 
 
 @pytest.mark.parametrize("factor", [0.8, 1.25])
