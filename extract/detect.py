@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,7 +20,7 @@ from .first_pose import edge_score, silhouette_ious, upright_rotation
 from .geometry import Array, make_pose, projected_box, scaled_camera
 from .handled import Handled, find_handled, reach_from_border
 from .raster import render_depth
-from .region import TrackingMesh, edge_strength, extract_outline, refine
+from .region import TrackingMesh, draw_outline, edge_strength, refine
 from .segment import Box, Mask, box_iou, mask_box, mask_from_box
 from .video import Image
 
@@ -35,7 +36,7 @@ MOVED_SHARE = 0.4  # of what is handled, least, where more than SOMETHING_MOVED 
 SOMETHING_MOVED = 0.005
 EXPLAINED_WEIGHT, REACHED_WEIGHT = 2.0, 1.0
 HAND_REACH = 0.65  # of the way from the picture's border to the farthest that moves: no sleeve goes so far
-REFINED = 8
+REFINED, CUT_ROUNDS = 8, 2
 PLACES, PLACES_WITHIN, REACHED_WITHIN = 3, 0.3, 0.1
 SAME_PLACE = 0.8  # of two boxes, intersection over union from which on one is as good as the other
 
@@ -140,7 +141,7 @@ def find_places(
         window = render_depth(mesh.vertices_m, mesh.faces, T, camera_matrix)
         if window is None or not (silhouette := window.mask_in_image(rgb.shape[1], rgb.shape[0])).any():
             continue
-        mask = mask_from_box(rgb, _grown(mask_box(silhouette), 0.06, rgb))
+        mask = mask_from_box(rgb, _grown(mask_box(silhouette), 0.06, rgb), CUT_ROUNDS)
         T = refine(
             mesh, T, camera_matrix, *mask_evidence(mask), steps_px=(5, 3, 2, 1),
             prior_rotation_rad=0.12, prior_translation=0.05, prior_depth=0.1,
@@ -190,41 +191,65 @@ def _slide(
     index: int, mesh: TrackingMesh, edges: NDArray[np.float32], camera_matrix: Array, places: NDArray[np.bool_]
 ) -> list[_Match]:
     """Best places of every template of one mesh, its centre where `places` (H, W) allow it."""
-    height, width = shape = places.shape
+    height, width = places.shape
+    longest = max(height, width)
     centre = np.array([width / 2, height / 2])
     inverse = np.linalg.inv(camera_matrix)
-    pad = int(0.5 * max(SIZES) * max(shape)) + 4
+    pad = int(0.5 * max(SIZES) * longest) + 4
     padded = np.pad(edges, [(0, 0), (pad, pad), (pad, pad)])
     matches = []
     for elevation in ELEVATIONS_DEG:
         for yaw in np.arange(0.0, 360.0, YAW_STEP_DEG):
             R = upright_rotation(elevation, float(yaw))
             extent = float(np.ptp(mesh.vertices_m @ R.T, axis=0)[:2].max())
-            for size in SIZES:
-                depth = extent * camera_matrix[0, 0] / (size * max(shape))
-                if depth < 2.0 * mesh.radius_m:
+            depths = [extent * camera_matrix[0, 0] / (size * longest) for size in SIZES]
+            poses = [make_pose(R, inverse @ np.array([*centre, 1.0]) * depth) for depth in depths]
+            # Drawn once, at a middling size: nearer or farther the outline runs along the same points.
+            drawn = draw_outline(mesh, poses[len(SIZES) // 2], camera_matrix, OUTLINE_POINTS, with_creases=False)
+            for T, depth in zip(poses, depths, strict=True):
+                if drawn is None or depth < 2.0 * mesh.radius_m:
                     continue
-                T = make_pose(R, inverse @ np.array([*centre, 1.0]) * depth)
-                outline = extract_outline(mesh, T, camera_matrix, (height, width), OUTLINE_POINTS)
+                outline = drawn.moved(T, camera_matrix).inside((height, width))
                 if outline is None or len(outline) < OUTLINE_POINTS // 2:
                     continue
                 angle = np.arctan2(outline.normal[:, 1], outline.normal[:, 0]) % np.pi
                 bins = np.round(angle * DIRECTIONS / np.pi).astype(int) % DIRECTIONS
                 offset = np.round(outline.pixel - centre).astype(int)
-                total = np.zeros((height, width), np.float32)
-                for k, (dx, dy) in zip(bins, offset, strict=True):
-                    if abs(dx) <= pad and abs(dy) <= pad:
-                        total += padded[k, pad + dy : pad + dy + height, pad + dx : pad + dx + width]
+                total = np.full((height, width), -np.inf, np.float32)
+                _add_up(padded, bins, offset, places, total)
                 # A long outline that fits is better evidence than a short one: noise averages out with its root.
                 steps = np.linalg.norm(np.diff(outline.pixel, axis=0), axis=1)
-                evidence = float(np.sqrt(np.minimum(steps, 12.0).sum() / max(shape))) / len(outline)
-                total[~places] = -np.inf
+                evidence = float(np.sqrt(np.minimum(steps, 12.0).sum() / longest)) / len(outline)
                 for _ in range(2):
                     y, x = np.unravel_index(int(np.argmax(total)), total.shape)
                     placed = make_pose(R, inverse @ np.array([x, y, 1.0]) * depth)
                     matches.append(_Match(float(total[y, x]) * evidence, index, placed))
                     total[max(y - 8, 0) : y + 9, max(x - 8, 0) : x + 9] = -np.inf
     return matches
+
+
+@numba.njit(cache=True)
+def _add_up(
+    edges: NDArray[np.float32], bins: NDArray[np.int_], offset: NDArray[np.int_], places: NDArray[np.bool_],
+    total: NDArray[np.float32],
+) -> None:  # fmt: skip
+    """Into `total` (H, W) what edge maps (D, H + 2 pad, W + 2 pad) hold along an outline, wherever `places` allow it.
+
+    bins: (N,) which map each point of the outline asks.  offset: (N, 2) x, y of the points from the place.
+    """
+    pad = (edges.shape[1] - len(places)) // 2
+    for y in range(len(places)):
+        allowed = np.flatnonzero(places[y])
+        if len(allowed) == 0:
+            continue
+        first, last = allowed[0], allowed[-1] + 1
+        row = np.zeros(last - first, np.float32)
+        for i in range(len(bins)):
+            dx, dy = offset[i]
+            if abs(dx) <= pad and abs(dy) <= pad:
+                row += edges[bins[i], pad + dy + y, pad + dx + first : pad + dx + last]
+        for x in allowed:
+            total[y, x] = row[x - first]
 
 
 def _judge(
