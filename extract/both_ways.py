@@ -69,16 +69,16 @@ def settle_rivals(clip: Clip, starts: Sequence[Start]) -> list[Start]:
     before: list[float] = []
 
     def tried(frames: Iterable[Frame]) -> None:
-        trials = {(n, k): _begun(clip, starts[n], k) for n, ks in enumerate(rivals) for k in ks}
+        trials = {(n, k): _begun(clip, starts[n], k).tracker for n, ks in enumerate(rivals) for k in ks}
         for frame in frames:
             away = abs(frame.index - clip.start_index)
             if away > TRIAL_FRAMES:
                 break
             depth = clip.depth_of(frame.index)
-            for key, follower in trials.items():
-                follower.step(frame.rgb, away, TRIAL_FRAMES, depth)
+            for key, tracker in trials.items():
+                tracker.step(frame.rgb, None, depth)
                 # Texture holds on to any shape: only the outline tells whether it is the right one.
-                sure.setdefault(key, []).append(replace(follower.tracker.signs, rigid=0.0).confidence)
+                sure.setdefault(key, []).append(replace(tracker.signs, rigid=0.0).confidence)
 
     def ahead() -> Iterator[Frame]:
         for frame in iterate_frames(clip.info.path, WORKING_SIDE_PX, clip.info):
