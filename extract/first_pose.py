@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
 from typing import Any
 
 import cv2
@@ -17,10 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from .candidates import Model
 from .colours import mask_evidence
-from .first_search import search_rotations
-from .geometry import Array, Symmetry, make_pose, super_fibonacci_rotations
+from .geometry import Array, Symmetry, make_pose, super_fibonacci_rotations, transform_points
 from .raster import render_depth
 from .region import Outline, TrackingMesh, edge_strength, extract_outline, refine
 from .segment import Box, Mask, box_iou, mask_box
@@ -28,15 +25,13 @@ from .video import Image
 
 ELEVATIONS_DEG = (0.0, 8.0, 16.0, 26.0, 38.0, 52.0)
 UPRIGHT_BONUS = 0.3  # an outline alone often fits leaning toward and away from the camera as well
-LEAN_LIMIT, BELOW_LIMIT = np.tan(np.deg2rad(30)), np.sin(np.deg2rad(3))  # of what is upright: in the image, from below
 EDGE_WEIGHT = 0.7
 BOX_WEIGHT = 1.2
 NO_TRUST = 0.1  # of a mask, below which the edges there are not asked for
 SEARCH_SIDE_PX = 72
 SEARCH_PAD = 0.25  # of the longer side, around the box
 SEARCH_FACES = 1000
-CLIMBED, CLIMB_DEG = 100, (8.0, 8.0, 4.0, 4.0)  # how many poses of the coarse search are turned, and in what steps
-ROUNDS: tuple[tuple[int, tuple[float, ...]], ...] = ((40, (3.0, 2.0, 1.0)), (10, (1.0, 1.0)))
+ROUNDS: tuple[tuple[int, tuple[float, ...]], ...] = ((40, (4.0, 2.0)), (14, (3.0, 2.0, 1.0)), (5, (1.0, 1.0)))
 """How many poses are refined in every round, and the steps in px along the outline's lines there."""
 
 
@@ -56,7 +51,7 @@ class PoseCandidate:
     edge: float = 0.0
     stands: bool = True
 
-    @cached_property
+    @property
     def merit(self) -> float:
         """What candidates are ranked by."""
         return (
@@ -80,49 +75,68 @@ def upright_rotation(elevation_deg: float, yaw_deg: float, roll_deg: float = 0.0
 
 def is_upright(T_camera_object: Array) -> bool:
     """Whether the object stands upright within 30 degrees in the image and is seen from above, as on a table."""
-    up, centre = T_camera_object[:3, 2], T_camera_object[:3, 3]
-    return bool(abs(up[0]) < -LEAN_LIMIT * up[1] and up @ centre < BELOW_LIMIT * np.linalg.norm(centre))
+    up, towards = T_camera_object[:3, 2], T_camera_object[:3, 3] / np.linalg.norm(T_camera_object[:3, 3])
+    lean_rad = np.arctan2(abs(up[0]), -up[1])
+    return bool(lean_rad < np.deg2rad(30) and up @ towards < np.sin(np.deg2rad(3)))
 
 
 def find_first_pose(
-    models: Sequence[Model],
+    mesh: TrackingMesh,
     rgb: Image,
     mask: Mask,
     camera_matrix: Array,
     *,
     box_xywh_px: Box | None = None,
     trust: NDArray[np.float32] | None = None,
-) -> list[tuple[PoseCandidate, Model]]:
-    """Poses of any of the models that explain a mask, best first.
+    symmetry: Symmetry = Symmetry(),  # noqa: B008 - frozen
+    any_rotation: bool = True,
+    stands: bool = True,
+) -> list[PoseCandidate]:
+    """Poses that explain a mask, best first.
 
-    Every model is drawn small with few faces in many rotations. The best of all models and of all kinds are turned to
-    where they agree best with the small mask, the best of these refined in the picture, and the best of those again.
+    Every rotation is drawn small with few faces; the best and the best of other kinds are refined a little, and the
+    best of these to the end.
 
     box_xywh_px: box around the whole object; the mask's own when not given.
     trust: (H, W) in [0, 1] how far the mask is to be believed there; everywhere when not given.
+    symmetry: turns after which the mesh looks the same need not be searched.
+    any_rotation: also try rotations that are not upright (600 of them, spread over SO(3)).
+    stands: whether the object is likely to stand on its -z.
     """
+    turns = symmetry.order if abs(symmetry.axis[2]) > 0.99 else 1
+    yaws = np.arange(0.0, 360.0 / turns, 10.0) if turns else (0.0,)
+    tries = [upright_rotation(e, float(yaw)) for e in ELEVATIONS_DEG for yaw in yaws]
+    if any_rotation:
+        tries += list(super_fibonacci_rotations(600))
     box = box_xywh_px or mask_box(mask)
+    scale = SEARCH_SIDE_PX / max(box[2], box[3])
     trust = np.ones(mask.shape, np.float32) if trust is None else trust
-    searches = [_Search.of(model, mask, camera_matrix, box, trust) for model in models]
-    found = [search.judged(_rotations(search.turns)) for search in searches]
-    found = [s.climbed(own) for s, own in zip(searches, _best_of_all(found, models, CLIMBED), strict=True)]
+    soft_mask, small_camera = _shrunk(mask, camera_matrix, box, scale)
+    small_trust, small_mask = _shrunk(trust, camera_matrix, box, scale)[0], soft_mask > 0.5
+    pad_px = SEARCH_PAD * SEARCH_SIDE_PX
+    small_box = (pad_px, pad_px, box[2] * scale, box[3] * scale)
+    light = _with_few_faces(mesh)
+    found = []
+    for R in tries:
+        T = _placed(light, R, small_camera, small_box)
+        ious = silhouette_ious(light, T, small_camera, small_mask, small_box, small_trust)
+        found.append(PoseCandidate(T, *ious, stands=stands))
+    found.sort(key=lambda c: c.merit, reverse=True)
+
     bins, colours = mask_evidence(mask, trust)
     edges = edge_strength(rgb)
     for count, steps_px in ROUNDS:
-        chosen, found = _best_of_all(found, models, count), []
-        for model, own in zip(models, chosen, strict=True):
-            refined = []
-            for candidate in own:
-                result = refine(
-                    model.mesh, candidate.T_camera_object, camera_matrix, bins, colours, steps_px=steps_px,
-                    prior_rotation_rad=0.12, prior_translation=0.05, prior_depth=0.1,
-                )  # fmt: skip
-                refined.append(
-                    judge(model.mesh, result.T_camera_object, camera_matrix, edges, mask, box, candidate.stands, trust)
-                )
-            found.append(refined)
-    ranked = [(c, model) for own, model in zip(found, models, strict=True) for c in own]
-    return sorted(ranked, key=lambda entry: entry[0].merit, reverse=True)
+        first = count // 5
+        chosen = found[:first] + distinct(found[first:], 15, count - first, np.inf, symmetry)
+        found = []
+        for candidate in chosen:
+            result = refine(
+                mesh, candidate.T_camera_object, camera_matrix, bins, colours, steps_px=steps_px,
+                prior_rotation_rad=0.12, prior_translation=0.05, prior_depth=0.1,
+            )  # fmt: skip
+            found.append(judge(mesh, result.T_camera_object, camera_matrix, edges, mask, box, stands, trust))
+        found.sort(key=lambda c: c.merit, reverse=True)
+    return found
 
 
 def judge(
@@ -232,83 +246,27 @@ def _share_on_edges(pixel: Array, normal: Array, strength: NDArray[np.float32]) 
     return float(np.mean(np.minimum(best, 1.0)))
 
 
-def _with_few_faces(mesh: TrackingMesh) -> tuple[Array, NDArray[np.int32]]:
-    """Vertices (V, 3) and faces (F, 3) of the mesh with SEARCH_FACES at most."""
+def _with_few_faces(mesh: TrackingMesh) -> TrackingMesh:
     if len(mesh.faces) <= SEARCH_FACES:
-        return mesh.vertices_m, mesh.faces
+        return mesh
     vertices, faces = fast_simplification.simplify(mesh.vertices_m, mesh.faces, target_count=SEARCH_FACES)[:2]
-    return np.ascontiguousarray(vertices, float), np.ascontiguousarray(faces, np.int32)
+    return TrackingMesh.build(np.asarray(vertices, float), np.asarray(faces, np.int32))
 
 
-@dataclass(frozen=True)
-class _Search:
-    """A model with few faces, and the mask around the box at a small size that it is compared with."""
-
-    model: Model
-    vertices_m: Array
-    faces: NDArray[np.int32]
-    camera_matrix: Array
-    box: Array
-    mask: Mask
-    trust: NDArray[np.float32]
-
-    @staticmethod
-    def of(model: Model, mask: Mask, camera_matrix: Array, box: Box, trust: NDArray[np.float32]) -> _Search:
-        scale, pad_px = SEARCH_SIDE_PX / max(box[2], box[3]), SEARCH_PAD * SEARCH_SIDE_PX
-        soft_mask, small_camera = _shrunk(mask, camera_matrix, box, scale)
-        small_trust = _shrunk(trust, camera_matrix, box, scale)[0]
-        small_box = np.array([pad_px, pad_px, box[2] * scale, box[3] * scale])
-        return _Search(model, *_with_few_faces(model.mesh), small_camera, small_box, soft_mask > 0.5, small_trust)
-
-    @property
-    def turns(self) -> int:
-        """After what share of a turn about +z the model is the same; 0 is any."""
-        symmetry = self.model.symmetry
-        return symmetry.order if abs(symmetry.axis[2]) > 0.99 else 1
-
-    def judged(self, rotations: Array) -> list[PoseCandidate]:
-        """The poses with rotations (N, 3, 3) whose projection has the box's size and centre."""
-        centres_m, ious = np.empty((len(rotations), 3)), np.empty((len(rotations), 2))
-        search_rotations(
-            self.vertices_m, self.faces, self.model.mesh.radius_m, rotations, self.camera_matrix, self.box,
-            self.mask, self.trust, centres_m, ious,
-        )  # fmt: skip
-        stands = self.model.vessel is not None
-        return [
-            PoseCandidate(make_pose(R, t), iou, box_iou, stands=stands)
-            for R, t, (iou, box_iou) in zip(rotations, centres_m, ious.tolist(), strict=True)
-        ]
-
-    def climbed(self, found: Sequence[PoseCandidate]) -> list[PoseCandidate]:
-        """The poses turned a little, again and again, to where they agree best with the mask."""
-        better = list(found)
-        for step_deg in CLIMB_DEG:
-            turns = Rotation.from_rotvec(step_deg * np.vstack([np.eye(3), -np.eye(3)]), degrees=True).as_matrix()
-            near = [self.judged(turns @ c.T_camera_object[:3, :3]) for c in better]
-            better = [max([c, *around], key=lambda c: c.merit) for c, around in zip(better, near, strict=True)]
-        return better
-
-
-@lru_cache
-def _rotations(turns: int) -> Array:
-    """(N, 3, 3) to try for a mesh that is the same after a `turns`-th of a turn about +z, any turn if it is 0."""
-    yaws_deg = np.arange(0.0, 360.0 / turns, 10.0) if turns else (0.0,)
-    upright = [upright_rotation(elevation, float(yaw)) for elevation in ELEVATIONS_DEG for yaw in yaws_deg]
-    return np.concatenate([upright, super_fibonacci_rotations(600)])
-
-
-def _best_of_all(
-    found: Sequence[Sequence[PoseCandidate]], models: Sequence[Model], count: int
-) -> list[list[PoseCandidate]]:
-    """The `count` best poses of all models, and of each model only its best few and the best of other kinds."""
-    pool: list[tuple[PoseCandidate, int]] = []
-    first = count // 5
-    for k, (own, model) in enumerate(zip(found, models, strict=True)):
-        ranked = sorted(own, key=lambda c: c.merit, reverse=True)
-        others = distinct(ranked[first:], 15, count - first, np.inf, model.symmetry)
-        pool += [(candidate, k) for candidate in [*ranked[:first], *others]]
-    pool.sort(key=lambda entry: entry[0].merit, reverse=True)
-    return [[c for c, of in pool[:count] if of == k] for k in range(len(models))]
+def _placed(mesh: TrackingMesh, R: Array, camera_matrix: Array, box: Box) -> Array:
+    """The pose with rotation R whose projection has the box's size and centre (FreePose, eq. 2)."""
+    target = np.array([box[0] + box[2] / 2, box[1] + box[3] / 2])
+    inverse, radius_m = np.linalg.inv(camera_matrix), mesh.radius_m
+    depth, aim = 10.0 * radius_m, target.copy()
+    for _ in range(3):
+        T = make_pose(R, inverse @ np.array([*aim, 1.0]) * depth)
+        points = transform_points(T, mesh.vertices_m)
+        pixels = (points @ camera_matrix.T)[:, :2] / np.maximum(points[:, 2:], 1e-6)
+        low, high = pixels.min(axis=0), pixels.max(axis=0)
+        depth *= float(np.sqrt(np.prod(high - low) / (box[2] * box[3])))
+        depth = max(depth, 1.2 * radius_m)
+        aim += target - (low + high) / 2
+    return make_pose(R, inverse @ np.array([*aim, 1.0]) * depth)
 
 
 def _shrunk(image: NDArray[Any], camera_matrix: Array, box: Box, scale: float) -> tuple[NDArray[np.float32], Array]:

@@ -18,7 +18,7 @@ from .background import mask_trust
 from .candidates import Model, ObjectRequest, vessel_model
 from .colours import mask_evidence
 from .errors import UserError
-from .first_pose import BOX_WEIGHT, PoseCandidate, distinct, find_first_pose, judge
+from .first_pose import PoseCandidate, distinct, find_first_pose, judge
 from .geometry import Array, scaled_camera
 from .raster import render_depth
 from .region import TrackingMesh, edge_strength
@@ -33,7 +33,6 @@ HYPOTHESES = 3  # first poses, far from each other, that a shape is fitted to
 HYPOTHESES_WITHIN = 0.5  # of the best one's merit
 APART_DEG = 40.0
 RIVAL_WITHIN = 0.2  # of the best one's merit: nearly as good
-FOUND_BOX_WEIGHT = 0.3  # for BOX_WEIGHT, of a box that was drawn around what looks like the object: no evidence of it
 FLAT_GREY_LEVELS = 2.0  # standard deviation in the box, below which there is nothing to see
 FIT_ROUNDS = 2  # of cutting the mask near the silhouette and fitting the shape to it, at full sharpness
 COARSE_STEPS_PX = (3.0, 1.5)
@@ -125,7 +124,7 @@ def start_object(
             refusal = error
     if not starts:
         raise refusal
-    return max(starts, key=lambda start: _worth(start.best.pose, source))
+    return max(starts, key=lambda start: start.best.pose.merit)
 
 
 def _start_in(
@@ -146,25 +145,24 @@ def _start_in(
     small = np.asarray(cv2.resize(rgb, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA), np.uint8)
     small_box, small_camera = scaled(box, shrink), scaled_camera(camera_matrix, shrink)
     cut = mask_from_box(small, small_box) if mask is None else resized(mask, small)
-    poses = find_first_pose(candidates, small, cut, small_camera, box_xywh_px=small_box, trust=_trust(cut, labels))
     ranked: list[tuple[PoseCandidate, Model]] = []
     for model in candidates:
-        own = distinct([c for c, m in poses if m is model], APART_DEG, HYPOTHESES, HYPOTHESES_WITHIN, model.symmetry)
-        ranked += [(pose, model) for pose in own]
+        poses = find_first_pose(
+            model.mesh, small, cut, small_camera, box_xywh_px=small_box, trust=_trust(cut, labels),
+            symmetry=model.symmetry, stands=model.vessel is not None,
+        )  # fmt: skip
+        ranked += [(pose, model) for pose in distinct(poses, APART_DEG, HYPOTHESES, HYPOTHESES_WITHIN, model.symmetry)]
     ranked.sort(key=lambda entry: entry[0].merit, reverse=True)
     if ranked[0][0].iou < FOUND_IOU:
         raise NotFoundError(
             f"object {request.name!r} was not found: the best silhouette covers only {ranked[0][0].iou:.0%} of what "
             "was cut out of the frame"
         )
-    firsts = ranked[:HYPOTHESES]
     fits = [
         _fitted(model, pose, small, cut, small_box, source, small_camera, labels, 1, COARSE_STEPS_PX)
-        for pose, model in firsts
+        for pose, model in ranked[:HYPOTHESES]
     ]
-    # A fit is judged on the mask re-cut near itself, which flatters what is wrong; the first pose was on one for all.
-    worth = [_worth(first, source) + _worth(fit[1], source) for (first, _), fit in zip(firsts, fits, strict=True)]
-    fits = [fits[k] for k in np.argsort(-np.array(worth), kind="stable")]
+    fits.sort(key=lambda fit: fit[1].merit, reverse=True)
     kept = distinct([pose for _, pose, _ in fits], APART_DEG, HYPOTHESES, RIVAL_WITHIN, fits[0][0].symmetry)
     found = [
         _hypothesis(model, pose, resized(evidence, rgb) if mask is None else mask, rgb, camera_matrix)
@@ -172,11 +170,6 @@ def _start_in(
         if any(pose is k for k in kept)
     ]
     return Start(tuple(found), source, box, labels)
-
-
-def _worth(pose: PoseCandidate, source: str) -> float:
-    """The merit of a pose; that it fits a box that was found counts little."""
-    return pose.merit - (source == "found") * (BOX_WEIGHT - FOUND_BOX_WEIGHT) * pose.box_iou
 
 
 def sharpened(start: Start, rgb: Image, camera_matrix: Array) -> Start:
