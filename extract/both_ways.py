@@ -24,7 +24,8 @@ from .starting import WORKING_SIDE_PX, Start, resized
 from .video import Frame, Image, VideoInfo, iterate_backward, iterate_frames
 
 TRIAL_FRAMES = 15  # either way, that rivals for the first pose are followed before one of them is taken
-MORE_LOOKS, SURE_ENOUGH, SURER = 2, 0.9, 0.01  # mean confidence: below the one by how much more it must come out
+MORE_LOOKS = 2  # most
+SURE_ENOUGH, SURER = 0.9, 0.01  # mean confidence from which on none is taken; by how much one must raise it
 TRIAL_MARGIN = 0.1  # of mean confidence by the outline, by which the one that looked worse at first must be better
 
 
@@ -129,17 +130,19 @@ def look_again(clip: Clip, done: Sequence[Followed], watched: Watched, progress:
     Better poses tell the shape better, and a better shape the poses: as long as that makes them surer.
     """
     best = list(done)
+    unsure = list(range(len(best)))
     for _ in range(MORE_LOOKS):
-        unsure = [k for k, known in enumerate(best) if known.vessel is not None and known.sure < SURE_ENOUGH]
+        unsure = [k for k in unsure if best[k].vessel is not None and best[k].sure < SURE_ENOUGH]
+        if not unsure:
+            break
         settled = [best[k].second_pass(clip.rgb) for k in unsure]
         begin = [partial(known.again, clip.rgb, clip.start_index) for known in settled]
         words = "following once more what is not followed surely"
-        more = _pass(clip, begin, Watched(watched.times), progress, words, False) if begin else []
+        more = _pass(clip, begin, Watched(watched.times), progress, words, False)
         surer = {k: new for k, new in zip(unsure, more, strict=True) if new.sure > best[k].sure + SURER}
         for k, new in surer.items():
             best[k] = replace(new, glimpses=best[k].glimpses)
-        if not surer:
-            break
+        unsure = list(surer)  # the others would come out as they did
     return best
 
 

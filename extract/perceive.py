@@ -315,9 +315,7 @@ def _find_in(
     info, small = scene.info, _small(sharp, scene)
     labels = None if scene.background is None else scene.background.labels(small)
     # What moved at any time, or, better, what covers something that was seen at another time.
-    moved = motion_since(small, scene.samples)
-    if labels is not None:
-        moved = np.array(COVERED)[labels]
+    moved = motion_since(small, scene.samples) if labels is None else np.array(COVERED)[labels]
     starts: list[Start] = []
     camera = scene.camera(scene.start_scale)
     for number, (request, candidates) in enumerate(zip(requests, models, strict=True)):

@@ -180,7 +180,7 @@ class VideoWriter:
 
     Use as a context manager; `write(rgb)` at the constant rate, or `write(rgb, time_s)` with real time stamps.
     Odd image sizes lose their last row or column, since 4:2:0 chroma needs even sizes.
-    preset: x264's; "ultrafast" takes 40 % of the time for files a third larger.
+    preset: x264's; "ultrafast" takes 40 % of the time for files half as large again.
     """
 
     def __init__(self, path: Path, fps: float, crf: int = 20, preset: str = "veryfast") -> None:
