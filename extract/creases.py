@@ -80,7 +80,7 @@ def crease_pixels(
     """Pixels (N, 2) of a depth image on inner contours, unit directions (N, 2) across, and which are jumps (N,)."""
     focal_px = float(camera_matrix[0, 0]), float(camera_matrix[1, 1])
     across, jumps = find_creases(depth_m, *focal_px, JUMP * radius_m, CLEAR_PX)
-    ys, xs = np.nonzero(across.any(axis=-1))
+    ys, xs = np.nonzero((across[..., 0] != 0) | (across[..., 1] != 0))
     picked = np.linspace(0, len(xs) - 1, min(MOST, len(xs))).round().astype(int)
     xs, ys = xs[picked], ys[picked]
     return np.stack([xs, ys], axis=1), across[ys, xs].astype(float), jumps[ys, xs]

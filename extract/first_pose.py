@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property, lru_cache
 from typing import Any
 
 import cv2
@@ -16,8 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from .candidates import Model
 from .colours import mask_evidence
-from .geometry import Array, Symmetry, make_pose, super_fibonacci_rotations, transform_points
+from .first_search import place_in_box, silhouettes_agree
+from .geometry import Array, Symmetry, make_pose, super_fibonacci_rotations
 from .raster import render_depth
 from .region import Outline, TrackingMesh, edge_strength, extract_outline, refine
 from .segment import Box, Mask, box_iou, mask_box
@@ -31,6 +34,7 @@ NO_TRUST = 0.1  # of a mask, below which the edges there are not asked for
 SEARCH_SIDE_PX = 72
 SEARCH_PAD = 0.25  # of the longer side, around the box
 SEARCH_FACES = 1000
+OTHER_DEG = 15.0  # from one pose to another kind
 ROUNDS: tuple[tuple[int, tuple[float, ...]], ...] = ((40, (4.0, 2.0)), (14, (3.0, 2.0, 1.0)), (5, (1.0, 1.0)))
 """How many poses are refined in every round, and the steps in px along the outline's lines there."""
 
@@ -51,7 +55,7 @@ class PoseCandidate:
     edge: float = 0.0
     stands: bool = True
 
-    @property
+    @cached_property
     def merit(self) -> float:
         """What candidates are ranked by."""
         return (
@@ -81,16 +85,13 @@ def is_upright(T_camera_object: Array) -> bool:
 
 
 def find_first_pose(
-    mesh: TrackingMesh,
+    model: Model,
     rgb: Image,
     mask: Mask,
     camera_matrix: Array,
     *,
     box_xywh_px: Box | None = None,
     trust: NDArray[np.float32] | None = None,
-    symmetry: Symmetry = Symmetry(),  # noqa: B008 - frozen
-    any_rotation: bool = True,
-    stands: bool = True,
 ) -> list[PoseCandidate]:
     """Poses that explain a mask, best first.
 
@@ -99,42 +100,22 @@ def find_first_pose(
 
     box_xywh_px: box around the whole object; the mask's own when not given.
     trust: (H, W) in [0, 1] how far the mask is to be believed there; everywhere when not given.
-    symmetry: turns after which the mesh looks the same need not be searched.
-    any_rotation: also try rotations that are not upright (600 of them, spread over SO(3)).
-    stands: whether the object is likely to stand on its -z.
     """
-    turns = symmetry.order if abs(symmetry.axis[2]) > 0.99 else 1
-    yaws = np.arange(0.0, 360.0 / turns, 10.0) if turns else (0.0,)
-    tries = [upright_rotation(e, float(yaw)) for e in ELEVATIONS_DEG for yaw in yaws]
-    if any_rotation:
-        tries += list(super_fibonacci_rotations(600))
     box = box_xywh_px or mask_box(mask)
-    scale = SEARCH_SIDE_PX / max(box[2], box[3])
     trust = np.ones(mask.shape, np.float32) if trust is None else trust
-    soft_mask, small_camera = _shrunk(mask, camera_matrix, box, scale)
-    small_trust, small_mask = _shrunk(trust, camera_matrix, box, scale)[0], soft_mask > 0.5
-    pad_px = SEARCH_PAD * SEARCH_SIDE_PX
-    small_box = (pad_px, pad_px, box[2] * scale, box[3] * scale)
-    light = _with_few_faces(mesh)
-    found = []
-    for R in tries:
-        T = _placed(light, R, small_camera, small_box)
-        ious = silhouette_ious(light, T, small_camera, small_mask, small_box, small_trust)
-        found.append(PoseCandidate(T, *ious, stands=stands))
-    found.sort(key=lambda c: c.merit, reverse=True)
-
+    found = _searched(model, mask, camera_matrix, box, trust)
     bins, colours = mask_evidence(mask, trust)
-    edges = edge_strength(rgb)
+    edges, stands = edge_strength(rgb), model.vessel is not None
     for count, steps_px in ROUNDS:
         first = count // 5
-        chosen = found[:first] + distinct(found[first:], 15, count - first, np.inf, symmetry)
+        chosen = found[:first] + distinct(found[first:], OTHER_DEG, count - first, np.inf, model.symmetry)
         found = []
         for candidate in chosen:
             result = refine(
-                mesh, candidate.T_camera_object, camera_matrix, bins, colours, steps_px=steps_px,
+                model.mesh, candidate.T_camera_object, camera_matrix, bins, colours, steps_px=steps_px,
                 prior_rotation_rad=0.12, prior_translation=0.05, prior_depth=0.1,
             )  # fmt: skip
-            found.append(judge(mesh, result.T_camera_object, camera_matrix, edges, mask, box, stands, trust))
+            found.append(judge(model.mesh, result.T_camera_object, camera_matrix, edges, mask, box, stands, trust))
         found.sort(key=lambda c: c.merit, reverse=True)
     return found
 
@@ -246,27 +227,42 @@ def _share_on_edges(pixel: Array, normal: Array, strength: NDArray[np.float32]) 
     return float(np.mean(np.minimum(best, 1.0)))
 
 
-def _with_few_faces(mesh: TrackingMesh) -> TrackingMesh:
+def _searched(
+    model: Model, mask: Mask, camera_matrix: Array, box: Box, trust: NDArray[np.float32]
+) -> list[PoseCandidate]:
+    """The model in many rotations where it fills the box, by how well it agrees with the mask there, best first."""
+    scale, pad_px = SEARCH_SIDE_PX / max(box[2], box[3]), SEARCH_PAD * SEARCH_SIDE_PX
+    soft_mask, small_camera = _shrunk(mask, camera_matrix, box, scale)
+    small_trust = _shrunk(trust, camera_matrix, box, scale)[0]
+    small_box = (pad_px, pad_px, box[2] * scale, box[3] * scale)
+    (vertices_m, faces), rotations = _with_few_faces(model.mesh), _rotations(model.symmetry)
+    origins_m = place_in_box(vertices_m, rotations, small_camera, small_box)
+    ious = silhouettes_agree(
+        vertices_m, faces, rotations, origins_m, small_camera, soft_mask > 0.5, small_trust, small_box
+    )
+    stands = model.vessel is not None
+    found = [
+        PoseCandidate(make_pose(R, t), iou, box_iou, stands=stands)
+        for R, t, (iou, box_iou) in zip(rotations, origins_m, ious.tolist(), strict=True)
+    ]
+    return sorted(found, key=lambda c: c.merit, reverse=True)
+
+
+def _with_few_faces(mesh: TrackingMesh) -> tuple[Array, NDArray[np.int32]]:
+    """Vertices (V, 3) and faces (F, 3) of the mesh with SEARCH_FACES at most."""
     if len(mesh.faces) <= SEARCH_FACES:
-        return mesh
+        return mesh.vertices_m, mesh.faces
     vertices, faces = fast_simplification.simplify(mesh.vertices_m, mesh.faces, target_count=SEARCH_FACES)[:2]
-    return TrackingMesh.build(np.asarray(vertices, float), np.asarray(faces, np.int32))
+    return np.ascontiguousarray(vertices, float), np.ascontiguousarray(faces, np.int32)
 
 
-def _placed(mesh: TrackingMesh, R: Array, camera_matrix: Array, box: Box) -> Array:
-    """The pose with rotation R whose projection has the box's size and centre (FreePose, eq. 2)."""
-    target = np.array([box[0] + box[2] / 2, box[1] + box[3] / 2])
-    inverse, radius_m = np.linalg.inv(camera_matrix), mesh.radius_m
-    depth, aim = 10.0 * radius_m, target.copy()
-    for _ in range(3):
-        T = make_pose(R, inverse @ np.array([*aim, 1.0]) * depth)
-        points = transform_points(T, mesh.vertices_m)
-        pixels = (points @ camera_matrix.T)[:, :2] / np.maximum(points[:, 2:], 1e-6)
-        low, high = pixels.min(axis=0), pixels.max(axis=0)
-        depth *= float(np.sqrt(np.prod(high - low) / (box[2] * box[3])))
-        depth = max(depth, 1.2 * radius_m)
-        aim += target - (low + high) / 2
-    return make_pose(R, inverse @ np.array([*aim, 1.0]) * depth)
+@lru_cache
+def _rotations(symmetry: Symmetry) -> Array:
+    """(N, 3, 3) to try for a mesh that looks the same after some turns."""
+    turns = symmetry.order if abs(symmetry.axis[2]) > 0.99 else 1
+    yaws_deg = np.arange(0.0, 360.0 / turns, 10.0) if turns else (0.0,)
+    upright = [upright_rotation(elevation, float(yaw)) for elevation in ELEVATIONS_DEG for yaw in yaws_deg]
+    return np.concatenate([upright, super_fibonacci_rotations(600)])
 
 
 def _shrunk(image: NDArray[Any], camera_matrix: Array, box: Box, scale: float) -> tuple[NDArray[np.float32], Array]:

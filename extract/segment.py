@@ -61,11 +61,10 @@ def mask_from_silhouette(rgb: Image, silhouette: Mask, band_px: int, iterations:
     labels[outer > 0] = cv2.GC_PR_BGD
     labels[silhouette] = cv2.GC_PR_FGD
     labels[inner > 0] = cv2.GC_FGD
-    ys, xs = np.nonzero(outer)
-    if len(xs) == 0:
+    if not silhouette.any():
         return silhouette
-    box = (int(xs.min()), int(ys.min()), int(np.ptp(xs)) + 1, int(np.ptp(ys)) + 1)
-    return _grabcut(rgb, labels, box, iterations)
+    x, y, w, h = (int(side) for side in mask_box(outer > 0))
+    return _grabcut(rgb, labels, (x, y, w, h), iterations)
 
 
 def mask_box(mask: Mask) -> Box:

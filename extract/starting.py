@@ -115,19 +115,50 @@ def start_object(
     labels: (H, W) of the background, at any resolution, where it is known.
     Raises NotFoundError when no pose of any candidate explains what is there.
     """
-    starts: list[Start] = []
+    # Coarse first: at full sharpness highlights and texture tear the mask apart.
+    shrink = min(1.0, WORKING_SIDE_PX / max(rgb.shape[:2]))
+    small = np.asarray(cv2.resize(rgb, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA), np.uint8)
+    camera, small_mask = scaled_camera(camera_matrix, shrink), None if mask is None else resized(mask, small)
+    found: list[tuple[Box, list[_Fit]]] = []
     refusal = NotFoundError(f"object {request.name!r} was not found: nothing looks like it")
     for box in boxes:
         try:
-            starts.append(_start_in(box, request, candidates, rgb, source, camera_matrix, mask, labels))
+            x, y, w, h = (round(v) for v in box)
+            if rgb[y : y + h, x : x + w].std(axis=(0, 1)).max() < FLAT_GREY_LEVELS:
+                raise NotFoundError(f"object {request.name!r} was not found: the frame is of one colour there")
+            there = scaled(box, shrink)
+            found.append((box, _fits_in(there, request, candidates, small, source, camera, small_mask, labels)))
         except NotFoundError as error:
             refusal = error
-    if not starts:
+    if not found:
         raise refusal
-    return max(starts, key=lambda start: start.best.pose.merit)
+    box, fits = max(found, key=lambda entry: entry[1][0].pose.merit)
+    kept = distinct([fit.pose for fit in fits], APART_DEG, HYPOTHESES, RIVAL_WITHIN, fits[0].model.symmetry)
+    explained = [
+        _hypothesis(fit, resized(fit.evidence(small, camera), rgb) if mask is None else mask, rgb, camera_matrix)
+        for fit in fits
+        if any(fit.pose is k for k in kept)
+    ]
+    return Start(tuple(explained), source, box, labels)
 
 
-def _start_in(
+@dataclass(frozen=True)
+class _Fit:
+    """A first pose carried on, and the mask it was fitted to, to be cut again so near its silhouette if it moved."""
+
+    model: Model
+    pose: PoseCandidate
+    mask: Mask
+    recut_px: int = 0
+
+    def evidence(self, rgb: Image, camera_matrix: Array) -> Mask:
+        """The mask that is to be believed."""
+        if not self.recut_px:
+            return self.mask
+        return _evidence(self.model.mesh, rgb, self.pose.T_camera_object, camera_matrix, self.mask, self.recut_px)
+
+
+def _fits_in(
     box: Box,
     request: ObjectRequest,
     candidates: Sequence[Model],
@@ -136,21 +167,16 @@ def _start_in(
     camera_matrix: Array,
     mask: Mask | None,
     labels: NDArray[np.uint8] | None,
-) -> Start:
-    x, y, w, h = (round(v) for v in box)
-    if rgb[y : y + h, x : x + w].std(axis=(0, 1)).max() < FLAT_GREY_LEVELS:
-        raise NotFoundError(f"object {request.name!r} was not found: the frame is of one colour there")
-    # Coarse first: at full sharpness highlights and texture tear the mask apart.
-    shrink = min(1.0, WORKING_SIDE_PX / max(rgb.shape[:2]))
-    small = np.asarray(cv2.resize(rgb, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA), np.uint8)
-    small_box, small_camera = scaled(box, shrink), scaled_camera(camera_matrix, shrink)
-    cut = mask_from_box(small, small_box) if mask is None else resized(mask, small)
+) -> list[_Fit]:
+    """The best first poses of any model in a box, the vessel's shape fitted coarsely to each; the best of these first.
+
+    Raises NotFoundError where none explains what is cut out there.
+    """
+    cut = mask_from_box(rgb, box) if mask is None else mask
+    trust = _trust(cut, labels)
     ranked: list[tuple[PoseCandidate, Model]] = []
     for model in candidates:
-        poses = find_first_pose(
-            model.mesh, small, cut, small_camera, box_xywh_px=small_box, trust=_trust(cut, labels),
-            symmetry=model.symmetry, stands=model.vessel is not None,
-        )  # fmt: skip
+        poses = find_first_pose(model, rgb, cut, camera_matrix, box_xywh_px=box, trust=trust)
         ranked += [(pose, model) for pose in distinct(poses, APART_DEG, HYPOTHESES, HYPOTHESES_WITHIN, model.symmetry)]
     ranked.sort(key=lambda entry: entry[0].merit, reverse=True)
     if ranked[0][0].iou < FOUND_IOU:
@@ -159,17 +185,10 @@ def _start_in(
             "was cut out of the frame"
         )
     fits = [
-        _fitted(model, pose, small, cut, small_box, source, small_camera, labels, 1, COARSE_STEPS_PX)
+        _fitted(model, pose, rgb, cut, box, source, camera_matrix, labels, 1, COARSE_STEPS_PX)
         for pose, model in ranked[:HYPOTHESES]
     ]
-    fits.sort(key=lambda fit: fit[1].merit, reverse=True)
-    kept = distinct([pose for _, pose, _ in fits], APART_DEG, HYPOTHESES, RIVAL_WITHIN, fits[0][0].symmetry)
-    found = [
-        _hypothesis(model, pose, resized(evidence, rgb) if mask is None else mask, rgb, camera_matrix)
-        for model, pose, evidence in fits
-        if any(pose is k for k in kept)
-    ]
-    return Start(tuple(found), source, box, labels)
+    return sorted(fits, key=lambda fit: fit.pose.merit, reverse=True)
 
 
 def sharpened(start: Start, rgb: Image, camera_matrix: Array) -> Start:
@@ -177,11 +196,11 @@ def sharpened(start: Start, rgb: Image, camera_matrix: Array) -> Start:
     best, *others = start.hypotheses
     given = start.box, start.box_source
     fit = _fitted(best.model, best.pose, rgb, best.evidence, *given, camera_matrix, start.labels, FIT_ROUNDS)
-    return replace(start, hypotheses=(_hypothesis(*fit, rgb, camera_matrix), *others))
+    return replace(start, hypotheses=(_hypothesis(fit, fit.evidence(rgb, camera_matrix), rgb, camera_matrix), *others))
 
 
-def _hypothesis(model: Model, pose: PoseCandidate, evidence: Mask, rgb: Image, camera_matrix: Array) -> Hypothesis:
-    T = pose.T_camera_object
+def _hypothesis(fit: _Fit, evidence: Mask, rgb: Image, camera_matrix: Array) -> Hypothesis:
+    model, pose, T = fit.model, fit.pose, fit.pose.T_camera_object
     silhouette = _silhouette(model.mesh, T, camera_matrix, rgb.shape)
     mask = evidence & silhouette
     if model.vessel is not None:
@@ -200,26 +219,30 @@ def _fitted(
     labels: NDArray[np.uint8] | None,
     rounds: int,
     steps_px: tuple[float, ...] = (3.0, 1.5, 1.0),
-) -> tuple[Model, PoseCandidate, Mask]:
+) -> _Fit:
     """One hypothesis carried on: the vessel's shape and pose fitted to the mask re-cut near its silhouette."""
     edges, band_px = edge_strength(rgb), max(3, round(RECUT_BAND * max(box[2], box[3])))
     T = pose.T_camera_object
     evidence = _evidence(model.mesh, rgb, T, camera_matrix, mask, band_px)
     trust = _trust(evidence, labels)
-    pose = judge(model.mesh, T, camera_matrix, edges, evidence, box, model.vessel is not None, trust)
-    for _ in range(rounds if model.vessel is not None else 0):
-        assert model.vessel is not None
+    pose = before = judge(model.mesh, T, camera_matrix, edges, evidence, box, model.vessel is not None, trust)
+    for number in range(rounds):
+        if model.vessel is None:
+            break
+        if number > 0:  # after the last one only what is kept needs a mask
+            evidence = _evidence(model.mesh, rgb, T, camera_matrix, evidence, band_px)
+            trust = _trust(evidence, labels)
+            before = judge(model.mesh, T, camera_matrix, edges, evidence, box, trust=trust)
         view = View(*mask_evidence(evidence, trust), T, box if source == "given" else None, edges)
         vessel, (T_fitted,) = fit_shape(model.vessel, [view], camera_matrix, steps_px)
         fitted = vessel_model(vessel)
-        before = judge(model.mesh, T, camera_matrix, edges, evidence, box, trust=trust)
         after = judge(fitted.mesh, T_fitted, camera_matrix, edges, evidence, box, trust=trust)
         if after.merit <= before.merit + 0.002:
             break  # a mask that lost a thin part misled the fit: edges and box tell
         model, T, pose = fitted, T_fitted, after
-        evidence = _evidence(model.mesh, rgb, T, camera_matrix, evidence, band_px)
-        trust = _trust(evidence, labels)
-    return model, pose, evidence
+    else:
+        return _Fit(model, pose, evidence, band_px)
+    return _Fit(model, pose, evidence)
 
 
 def _trust(mask: Mask, labels: NDArray[np.uint8] | None) -> NDArray[np.float32] | None:

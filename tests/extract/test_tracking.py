@@ -105,9 +105,9 @@ def test_box_outside_the_picture_is_refused(box: tuple) -> None:
 
 
 @pytest.mark.parametrize("yaw_deg", [30, 150, -30])
-def test_first_pose_is_found_from_a_mask(mesh, yaw_deg: float) -> None:
+def test_first_pose_is_found_from_a_mask(mug, mesh, yaw_deg: float) -> None:
     T = pose_of(yaw_deg=yaw_deg)
-    found = find_first_pose(mesh, picture(mesh, T), silhouette(mesh, T), K)[0].T_camera_object
+    found = find_first_pose(vessel_model(mug), picture(mesh, T), silhouette(mesh, T), K)[0].T_camera_object
     assert np.rad2deg(rotation_angle_rad(found[:3, :3], T[:3, :3])) < 8
     assert np.linalg.norm(found[:2, 3] - T[:2, 3]) < 0.005
     assert abs(found[2, 3] - T[2, 3]) < 0.03
@@ -153,7 +153,7 @@ def test_shape_fit_recovers_height_and_radius(mug) -> None:
     taller = make_vessel("mug", height_m=1.15 * mug.params["height_m"])
     T = pose_of(15, 60)
     truth = silhouette(tracking_mesh(taller), T)
-    start = find_first_pose(tracking_mesh(mug), picture(tracking_mesh(taller), T), truth, K)[0].T_camera_object
+    start = find_first_pose(vessel_model(mug), picture(tracking_mesh(taller), T), truth, K)[0].T_camera_object
     fitted, (pose,) = fit_shape(mug, [View(*mask_evidence(truth), start)], K)
     ratio = [v.params["height_m"] / v.params["top_radius_m"] for v in (mug, fitted, taller)]
     assert abs(ratio[1] - ratio[2]) < 0.6 * abs(ratio[0] - ratio[2])
