@@ -192,7 +192,7 @@ def _box(known: Followed, index: int) -> Box | None:
 
 def _joined(backward: Followed, forward: Followed, start: int) -> Followed:
     """One object over the whole clip; both halves hold the start frame."""
-    glimpses = [replace(g, index=start - g.index) for g in reversed(backward.glimpses) if g.index > 0]
+    glimpses = [g.reversed(start) for g in reversed(backward.glimpses) if g.index > 0]
     glimpses += [replace(g, index=start + g.index) for g in forward.glimpses]
     estimates = [*reversed(backward.estimates[1:]), *forward.estimates]
     return replace(forward, estimates=estimates, glimpses=glimpses)

@@ -10,6 +10,7 @@ sure neighbours, with all that the clip has taught by then.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -27,6 +28,7 @@ from .region import TrackingMesh, edge_strength
 from .segment import Mask
 from .shape_fit import View, fit_shape, tracking_mesh
 from .spin import HIDDEN_EVIDENCE, SURELY_OURS, best_turns, object_evidence, turn_scores, turned
+from .surface_flow import CarriedPoints, SurfaceFlow, spin_by_flow
 from .tracker import Estimate, ObjectTracker
 from .vessels import Vessel
 from .video import Image
@@ -42,15 +44,22 @@ SURE = 0.5  # least confidence of a frame that the shape may be fitted to
 @dataclass(frozen=True)
 class Glimpse:
     """What is kept of a frame: at half size how object-coloured it is and where it has edges, (H, W) both, see
-    `turn_scores`; and, of some frames, all that a shape fit needs, and the depth if there is any."""
+    `turn_scores`; where points of the surface came from, if they could be followed here from the glimpse before; and,
+    of some frames, all that a shape fit needs, and the depth if there is any."""
 
     index: int
     evidence: NDArray[np.float32]
     near_edge: NDArray[np.float32]
+    flow: SurfaceFlow | None = None
     bins: NDArray[np.int32] | None = None
     edges: NDArray[np.float32] | None = None
     colours: ColourModel | None = None
     depth: DepthView | None = None
+
+    def reversed(self, start_index: int) -> Glimpse:
+        """The same, of one that counted frames backward from a start frame."""
+        flow = None if self.flow is None else replace(self.flow, frames=-self.flow.frames)
+        return replace(self, index=start_index - self.index, flow=flow)
 
 
 @dataclass
@@ -66,6 +75,7 @@ class Followed:
     first_look: list[Estimate] | None = None
     estimates: list[Estimate] = field(default_factory=list)
     glimpses: list[Glimpse] = field(default_factory=list)
+    carried: CarriedPoints | None = None
 
     @staticmethod
     def start(
@@ -97,9 +107,23 @@ class Followed:
         guess = None if self.guesses is None else self.guesses[min(index, len(self.guesses) - 1)]
         now = self.tracker.step(rgb, guess, depth)
         self.estimates.append(now if before is None or now.confidence > before.confidence else before)
-        stride = max(1, frame_count // GLIMPSES)
-        if self.guesses is None and self.vessel is not None and index % stride == 0:
-            self.glimpses.append(self._glimpse(rgb, index, depth, whole=len(self.glimpses) % WHOLE_EVERY == 0))
+        if self.guesses is None and self.vessel is not None:
+            self._look(rgb, index, frame_count, depth, self.vessel.symmetry.order != 0)
+
+    def _look(self, rgb: Image, index: int, frame_count: int, depth: DepthView | None, spins: bool) -> None:
+        """Carry points of the surface on, and keep a glimpse of every so many frames."""
+        grey = np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), np.uint8)
+        if self.carried is not None:
+            self.carried.step(grey)
+        if index % max(1, frame_count // GLIMPSES) == 0:
+            glimpse = self._glimpse(rgb, index, depth, whole=len(self.glimpses) % WHOLE_EVERY == 0)
+            self.glimpses.append(replace(glimpse, flow=None if self.carried is None else self.carried.flow()))
+            seen = render_depth(
+                self.mesh.vertices_m, self.mesh.faces, self.estimates[-1].T_camera_object, self.camera_matrix
+            )
+            self.carried = None
+            if spins and self.estimates[-1].visible and seen is not None:
+                self.carried = CarriedPoints(grey, seen.mask_in_image(rgb.shape[1], rgb.shape[0]))
 
     def _glimpse(self, rgb: Image, index: int, depth: DepthView | None, whole: bool) -> Glimpse:
         bins, edges, colours = colour_bins(rgb), edge_strength(rgb), self.tracker.colours
@@ -114,7 +138,7 @@ class Followed:
         evidence, near_edge = evidence[::2, ::2], near_edge[::2, ::2]
         if not whole:
             return Glimpse(index, evidence, near_edge)
-        return Glimpse(index, evidence, near_edge, bins, edges, colours.copy(), depth)
+        return Glimpse(index, evidence, near_edge, None, bins, edges, colours.copy(), depth)
 
     def second_pass(self, first_rgb: Image) -> Followed:
         """The same object before the first frame again, with spin and shape settled."""
@@ -167,10 +191,32 @@ class Followed:
         if len(glimpses) < 2:
             return poses
         at = np.array([g.index for g in glimpses])
+        poses, told = self._spun_with_flow(poses, glimpses, axis)
         scores = [
             turn_scores(light, poses[g.index], camera, g.evidence, g.near_edge, axis, within_rad) for g in glimpses
         ]
-        return turned(poses, at, best_turns(poses[at], np.stack(scores)), axis)
+        return turned(poses, at, best_turns(poses[at], np.stack(scores), told), axis)
+
+    def _spun_with_flow(
+        self, poses: Array, glimpses: list[Glimpse], axis_xy_m: tuple[float, float]
+    ) -> tuple[Array, NDArray[np.bool_]]:
+        """The poses spun from glimpse to glimpse as the flow between them says; and whether it says so, by glimpse."""
+        spins, told = np.zeros(len(glimpses)), np.zeros(len(glimpses), bool)
+        for m, (before, after) in enumerate(pairwise(glimpses), start=1):
+            apart = after.index - before.index
+            for flow, one, other in ((after.flow, before, after), (before.flow, after, before)):
+                if flow is None or flow.frames != other.index - one.index:
+                    continue
+                spin = spin_by_flow(
+                    self.mesh, poses[one.index], poses[other.index], self.camera_matrix, flow, axis_xy_m
+                )
+                if spin is not None:
+                    spins[m], told[m] = np.sign(apart * flow.frames) * spin, True
+        if not told.any():
+            return poses, told
+        at = np.array([g.index for g in glimpses])
+        turns = Rotation.from_rotvec(np.outer(np.cumsum(spins), [0.0, 0.0, 1.0])).as_matrix()
+        return turned(poses, at, turns, axis_xy_m), told
 
     def _fitted(self, poses: Array, vessel: Vessel) -> tuple[Vessel, Array]:
         """The vessel fitted to several frames, and its poses in all; unchanged if that is no better."""

@@ -44,13 +44,13 @@ class ClassicalTracks:
                 at = np.flatnonzero(begun)
                 if not len(at):
                     continue
-                there, sure = _moved(greys[k], greys[k + step], pixels[k, at])
+                there, sure = moved_points(greys[k], greys[k + step], pixels[k, at])
                 pixels[k + step, at] = there
                 confidence[k + step, at] = np.minimum(confidence[k, at], sure)
         return PointTracks(pixels, confidence > 0, confidence)
 
 
-def _moved(before: NDArray[Any], after: NDArray[Any], pixels: Floats) -> tuple[Floats, Floats]:
+def moved_points(before: NDArray[Any], after: NDArray[Any], pixels: Floats) -> tuple[Floats, Floats]:
     """Where points (P, 2) went, and how sure that is, (P,): 1 where the way back ends at its start."""
     start = np.ascontiguousarray(pixels[:, None])
     there, found, _ = cv2.calcOpticalFlowPyrLK(before, after, start, start.copy(), **FLOW)

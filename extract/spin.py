@@ -23,12 +23,15 @@ from .raster import render_depth
 from .region import TrackingMesh
 
 SPINS = 36
+STEP_RAD = 2 * np.pi / SPINS
 EVIDENCE_RANGE = (-1.0, 2.0)  # log-odds; skin over a handle must not outvote the frames that show the handle
 SURELY_OURS = 2.0  # times as likely the object's colours as those of a hand: what stands there is not the hand
 HIDDEN_EVIDENCE = 0.3  # where something hides what is there: hands hold vessels by what sticks out
 SPIN_RAD = 2 * np.pi * np.minimum(np.arange(SPINS), SPINS - np.arange(SPINS)) / SPINS  # from none
-TURN_COST = 0.07  # of a change by one step between neighbouring samples, in mean log-odds over the object's area
+TURN_COST = 0.035  # of a change by one step between neighbouring samples, in mean log-odds over the object's area
 MOST_STEPS = 6  # a change by more costs no more: hands may be quick
+SPIN_COST, MOST_SPIN_STEPS = 0.07, 9  # of a spin by one step about the own axis between them: hands seldom do that
+TOLD_COST = 0.5  # of a change by one step, however large, where the spin between two samples was told
 OUTER_WEIGHT, INNER_WEIGHT = 0.3, 0.15  # of edges along the outline and inside it, against the colours
 EXPECTED = 0.5  # edge along a right inner contour, least: less speaks against it
 JUMP = 0.08  # of the mesh's radius, in depth, that makes an inner contour
@@ -75,27 +78,40 @@ def turn_scores(
     return np.where(asked, scores, -np.inf)
 
 
-def best_turns(T: Array, scores: Array) -> Array:
+def best_turns(T: Array, scores: Array, told: NDArray[np.bool_] | None = None) -> Array:
     """(M, 3, 3) turns to apply to M poses, in each one's object frame, that maximise the scores less the changing.
 
-    T: (M, 4, 4).  scores: (M, 2, SPINS) from `turn_scores`.
+    T: (M, 4, 4).  scores: (M, 2, SPINS) from `turn_scores`.  told: (M,) whether the poses are known to turn rightly
+    from each one's predecessor to it.
     """
     spins = Rotation.from_rotvec([[0.0, 0.0, 2 * np.pi * k / SPINS] for k in range(SPINS)]).as_matrix()
     plain = np.broadcast_to(spins, (len(T), SPINS, 3, 3))
     flips = np.stack([pose[:3, :3].T @ mirrored(pose)[:3, :3] for pose in T])
     turns = np.concatenate([plain, np.einsum("mij,kjl->mkil", flips, spins)], axis=1)
     scores = scores.reshape(len(T), -1)
+    stand = T[:, None, :3, :3] @ turns
     total, back = scores[0].copy(), np.zeros(scores.shape, int)
     for m in range(1, len(scores)):
-        cosine = (np.einsum("iab,jab->ij", turns[m], turns[m - 1]) - 1) / 2
-        steps = np.arccos(np.clip(cosine, -1, 1)) * SPINS / (2 * np.pi)
-        options = total[None, :] - TURN_COST * np.minimum(steps, MOST_STEPS) ** 2
+        steps = _angles_rad(turns[m], turns[m - 1]) / STEP_RAD
+        if told is not None and told[m]:
+            cost = TOLD_COST * steps**2
+        else:
+            leant_rad = np.arccos(np.clip(stand[m][:, :, 2] @ stand[m - 1][:, :, 2].T, -1, 1))
+            spin_rad = np.sqrt(np.maximum(_angles_rad(stand[m], stand[m - 1]) ** 2 - leant_rad**2, 0.0))
+            cost = TURN_COST * np.minimum(steps, MOST_STEPS) ** 2
+            cost += SPIN_COST * np.minimum(spin_rad / STEP_RAD, MOST_SPIN_STEPS) ** 2
+        options = total[None, :] - cost
         back[m] = np.argmax(options, axis=1)
         total = scores[m] + np.max(options, axis=1)
     path = [int(np.argmax(total))]
     for m in range(len(scores) - 1, 0, -1):
         path.append(int(back[m][path[-1]]))
     return np.asarray(turns[np.arange(len(T)), path[::-1]])
+
+
+def _angles_rad(one: Array, other: Array) -> Array:
+    """(I, J) angles between rotations (I, 3, 3) and (J, 3, 3)."""
+    return np.asarray(np.arccos(np.clip((np.einsum("iab,jab->ij", one, other) - 1) / 2, -1, 1)))
 
 
 def turned(T: Array, at: NDArray[np.int_], turns: Array, axis_xy_m: tuple[float, float] = (0.0, 0.0)) -> Array:

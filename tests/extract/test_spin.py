@@ -107,3 +107,12 @@ def test_scores_are_highest_at_the_spin_that_is_seen() -> None:
     scores = turn_scores(mesh, T, CAMERA, evidence, axis_xy_m=axis)
     assert abs(int(np.argmax(scores[0])) - 9) <= 1
     assert scores[0].max() > scores[1].max()  # near the camera, perspective tells the mirror image apart
+
+
+def test_what_is_told_outvotes_frames_that_seem_to_show_a_jump() -> None:
+    T = np.tile(make_pose(np.eye(3), (0.0, 0.0, 0.5)), (12, 1, 1))
+    scores = np.zeros((12, 2, SPINS))
+    scores[:6, 0, 0], scores[6:, 0, 9] = 1.5, 1.0
+    for told, jumps in ((False, True), (True, False)):
+        turns = best_turns(T, scores, np.full(12, told))
+        assert (np.abs(turns[0] - turns[-1]).max() > 0.1) == jumps

@@ -11,6 +11,8 @@ from scipy.spatial.transform import Rotation
 from vid2demo.extract.geometry import Symmetry, focal_prior_camera_matrix, make_pose, rotation_angle_rad
 from vid2demo.extract.raster import render_depth
 from vid2demo.extract.region import TrackingMesh
+from vid2demo.extract.spin import spun
+from vid2demo.extract.surface_flow import CarriedPoints, SurfaceFlow, spin_by_flow
 from vid2demo.extract.texture import Texture, flattened
 from vid2demo.extract.tracker import ObjectTracker, Signs
 
@@ -184,3 +186,54 @@ def test_confidence_rises_with_every_sign_and_says_little_of_nothing() -> None:
     assert all(s.confidence > base.confidence for s in better)
     assert Signs(0.0, 0.1, 0.0).confidence < 0.1
     assert Signs(0.95, 0.9, 0.9).confidence > 0.95
+
+
+def flow_through(can: TrackingMesh, poses: list[np.ndarray], printed: np.ndarray | None) -> SurfaceFlow | None:
+    """The flow from the first picture of a can to the last; sensor noise is drawn anew in each."""
+    greys = [cv2.cvtColor(picture(can, T, k, printed), cv2.COLOR_RGB2GRAY) for k, T in enumerate(poses)]
+    inside = np.abs(np.arange(greys[0].shape[1]) - greys[0].shape[1] / 2) < 25
+    points = CarriedPoints(greys[0], np.broadcast_to(inside, greys[0].shape))
+    for grey in greys[1:]:
+        points.step(grey)
+    return points.flow()
+
+
+@pytest.mark.parametrize("step_deg", [-4.0, 0.0, 3.0])
+def test_a_printed_can_tells_by_how_much_it_spun_more_than_its_poses_say(can: TrackingMesh, step_deg: float) -> None:
+    true = [pose(step_deg * k, lean_deg=2.0 * k, x_m=0.002 * k) for k in range(6)]
+    flow = flow_through(can, true, label())
+    assert flow is not None
+    assert flow.frames == 5
+    for missed_deg in (-9.0, 0.0, 14.0):
+        said = spun(true[-1], np.deg2rad(-missed_deg))
+        assert spin_by_flow(can, true[0], said, K, flow) == pytest.approx(np.deg2rad(missed_deg), abs=np.deg2rad(1.5))
+
+
+def test_a_flow_backward_in_time_tells_the_opposite(can: TrackingMesh) -> None:
+    true = [pose(4.0 * k) for k in range(4)]
+    there, back = flow_through(can, true, label()), flow_through(can, true[::-1], label())
+    assert there is not None
+    assert back is not None
+    forward = spin_by_flow(can, true[0], true[0], K, there)
+    backward = spin_by_flow(can, true[-1], true[-1], K, back)
+    assert forward == pytest.approx(np.deg2rad(12.0), abs=np.deg2rad(1.5))
+    assert backward == pytest.approx(-np.deg2rad(12.0), abs=np.deg2rad(1.5))
+
+
+def test_a_mesh_that_is_only_like_the_can_tells_it_as_well(can: TrackingMesh) -> None:
+    true = [pose(3.0 * k) for k in range(5)]
+    flow = flow_through(can, true, label())
+    slim = TrackingMesh.build(can.vertices_m * [0.92, 0.92, 1.05], can.faces)
+    assert flow is not None
+    assert spin_by_flow(slim, true[0], true[0], K, flow) == pytest.approx(np.deg2rad(12.0), abs=np.deg2rad(2.5))
+
+
+def test_a_plain_can_tells_nothing(can: TrackingMesh) -> None:
+    assert flow_through(can, [pose(4.0 * k) for k in range(6)], None) is None
+
+
+def test_points_that_move_at_random_tell_nothing(can: TrackingMesh) -> None:
+    flow = flow_through(can, [pose(0.0)] * 3, label())
+    assert flow is not None
+    astray = flow.after_px + np.random.default_rng(0).normal(0, 12, flow.after_px.shape)
+    assert spin_by_flow(can, pose(0.0), pose(0.0), K, SurfaceFlow(2, flow.before_px, astray)) is None
