@@ -5,80 +5,35 @@ Find every object in the start frame, fit its mesh and pose there, follow it thr
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 import cv2
 import numpy as np
 
-from .background import COVERED, SAMPLES, Background, learn_background
-from .both_ways import Clip, Watched, follow_both_ways, look_again, settle_rivals
+from .attempts import TRUSTED_CONFIDENCE, Scene, best_attempt, with_told_focal
+from .background import SAMPLES, learn_background
 from .camera_of_tracks import with_camera
 from .candidates import Model, vessel_model
 from .candidates import ObjectRequest as ObjectRequest
 from .candidates import candidate_models as candidate_models
-from .depth_size import sized
 from .depth_video import DepthVideo
-from .detect import find_places, motion_since
 from .errors import UserError
 from .files import atomic_path
-from .focal import focal_of_clip, scaled_focal
 from .follow import Followed
-from .geometry import Array, focal_prior_camera_matrix, projected_box, scaled_camera
-from .masks import read_mask, write_masks
+from .geometry import Array, focal_prior_camera_matrix
+from .masks import write_masks
 from .overlay import OverlayItem, write_overlay
 from .progress import Progress
 from .rerun_log import load_rerun, write_rerun
-from .segment import Box, Mask, check_box, mask_box
+from .segment import Mask, check_box
 from .smoothing import smooth_poses
-from .starting import STARTING_SIDE_PX, WORKING_SIDE_PX, NotFoundError, Start, resized, scaled, sharpened, start_object
+from .starting import STARTING_SIDE_PX, WORKING_SIDE_PX, Start
 from .track import ObjectTrack
-from .video import Image, VideoInfo, iterate_frames, read_video_info, sample_frames
+from .video import VideoInfo, read_video_info, sample_frames
 
-TRUSTED_CONFIDENCE = 0.6  # mean over the clip, of an object that nobody pointed at
-LESS_SURE = 0.05  # of confidence, that a focal length told by the clip may cost: noise, if it is right
-SURELY_FOLLOWED = 0.65  # mean confidence over the clip, below which it is tried from another frame as well
-AWAY_FRAMES, FOLLOWED_THERE, ELSEWHERE_MARGIN = 12, 0.4, 0.15  # least distance, confidence and gain of that
 SEEN_SHARE = 0.1  # of the clip, least
-OTHER_FRAMES = (45,)  # looked at when what was found in the first cannot be followed surely
-
-
-@dataclass(frozen=True)
-class _Scene:
-    """The video with its camera at full, starting and working size; frames spread over it, and their background.
-
-    depth: of its frames, where a depth camera filmed as well.
-    """
-
-    info: VideoInfo
-    camera_matrix: Array
-    start_scale: float
-    scale: float
-    samples: Sequence[Image]
-    background: Background | None
-    depth: DepthVideo | None = None
-
-    def camera(self, scale: float) -> Array:
-        return scaled_camera(self.camera_matrix, scale)
-
-
-@dataclass(frozen=True)
-class _Attempt:
-    """The objects as they were found in one frame, `sharp`, and followed from there."""
-
-    scene: _Scene
-    sharp: Image
-    index: int
-    starts: list[Start]
-    followed: list[Followed]
-    watched: Watched
-
-    @property
-    def sure(self) -> float:
-        """Mean confidence of the handled object."""
-        return float(np.mean([e.confidence for e in self.followed[0].estimates]))
 
 
 def extract(
@@ -125,25 +80,13 @@ def extract(
     samples = [frame.rgb for frame in sample_frames(info, SAMPLES, WORKING_SIDE_PX)]
     background = None if camera_motion == "moving" else learn_background(samples)
     filmed = None if depth is None else DepthVideo.open(depth, info, depth_scale_mm)
-    scene = _Scene(info, camera_matrix, start_scale, scale, samples, background, filmed)
-    attempts: list[_Attempt] = []
-    for index, sharp, starts in _found(scene, requests, models, start_frame):
-        attempts.append(_attempt(scene, index, sharp, starts, report, camera_motion != "static"))
-        if starts[0].box_source != "found" or attempts[-1].sure >= TRUSTED_CONFIDENCE:
-            break
-        report(0, info.frame_count, f"looking again for {requests[0].name}, in another frame")
-    best = max(attempts, key=lambda attempt: attempt.sure)
-    if best.sure < SURELY_FOLLOWED:
-        report(0, info.frame_count, f"looking again for {requests[0].name}, in a frame that shows it better")
-        again = _from_elsewhere(best, requests, models, report, camera_motion != "static")
-        if again is not None and again.sure > best.sure + ELSEWHERE_MARGIN:
-            best = again
-    clip = _clip(scene, best.index, best.sharp)
-    best = replace(best, followed=look_again(clip, best.followed, best.watched, report))
+    scene = Scene(info, camera_matrix, start_scale, scale, samples, background, filmed)
+    watch_camera = camera_motion != "static"
+    best = best_attempt(scene, requests, models, start_frame, report, watch_camera=watch_camera)
     camera_told: dict[str, Any] = {"source": camera_source}
     if camera is None and requests[0].mesh is not None:
-        best, camera_told = _with_told_focal(best, requests, models, report, camera_motion != "static")
-    scene, index, starts, followed, watched = best.scene, best.index, best.starts, best.followed, best.watched
+        best, camera_told = with_told_focal(best, requests, models, report, watch_camera)
+    scene, starts, followed, watched = best.scene, best.starts, best.followed, best.watched
     time_s = np.array([watched.times[k] for k in sorted(watched.times)])
 
     tracks: dict[str, ObjectTrack] = {}
@@ -154,7 +97,7 @@ def extract(
         raw = np.stack([e.T_camera_object for e in result.estimates])
         model = start.best.model if result.vessel is None else vessel_model(result.vessel)
         smooth = smooth_poses(raw, time_s, confidence * visible)
-        header = _header(request, scene, start, model, index)
+        header = _header(request, scene, start, model)
         header["camera"] = camera_told
         header["video"]["cuts"] = [{"frame": c.index, "time_s": round(c.time_s, 4)} for c in watched.cuts.cuts]
         header["settings"] |= {"spin_source": result.spin_source, "seed": seed}
@@ -195,156 +138,6 @@ def write_tracks(
         write_rerun(info.path, items, out / "extract.rrd")
 
 
-def _attempt(
-    scene: _Scene, index: int, sharp: Image, starts: list[Start], report: Progress, watch_camera: bool
-) -> _Attempt:
-    clip = _clip(scene, index, sharp)
-    near = clip.depth_of(index)
-    starts = settle_rivals(clip, [sized(start, near) for start in starts])
-    starts = [sized(sharpened(start, sharp, scene.camera(scene.start_scale)), near) for start in starts]
-    followed, watched = follow_both_ways(clip, starts, report, watch_camera=watch_camera)
-    return _Attempt(scene, sharp, index, starts, followed, watched)
-
-
-def _clip(scene: _Scene, index: int, sharp: Image) -> Clip:
-    return Clip(scene.info, index, _small(sharp, scene), scene.camera(scene.scale), scene.background, scene.depth)
-
-
-def _from_elsewhere(
-    first: _Attempt, requests: Sequence[ObjectRequest], models: Sequence[list[Model]], report: Progress, watch: bool
-) -> _Attempt | None:
-    """The objects looked for again where they were followed most surely, away from where they were found.
-
-    A thing that was lifted has left its shadow, and a hand that moves hides other parts of it.
-    """
-    scene = first.scene
-    sure = np.array([e.confidence * e.visible for e in first.followed[0].estimates])
-    sure[max(0, first.index - AWAY_FRAMES) : first.index + AWAY_FRAMES + 1] = 0.0
-    index = int(np.argmax(sure))
-    boxes = [
-        projected_box(f.camera_matrix, f.estimates[index].T_camera_object, f.mesh.vertices_m) for f in first.followed
-    ]
-    if sure[index] < FOLLOWED_THERE or any(box is None for box in boxes):
-        return None
-    frames = iterate_frames(scene.info.path, STARTING_SIDE_PX, scene.info)
-    sharp = next((frame.rgb for frame in frames if frame.index == index), None)
-    if sharp is None:
-        return None
-    try:
-        starts = _find_in(sharp, scene, requests, models, [scaled(b, 1 / scene.scale) for b in boxes if b is not None])
-    except UserError:
-        return None
-    return _attempt(scene, index, sharp, starts, report, watch)
-
-
-def _with_told_focal(
-    first: _Attempt,
-    requests: Sequence[ObjectRequest],
-    models: Sequence[list[Model]],
-    report: Progress,
-    watch_camera: bool,
-) -> tuple[_Attempt, dict[str, Any]]:
-    """The objects followed again with the focal length that the handled one tells, and what the header says of it.
-
-    As they were, with the prior, where it tells none, is unsure or in favour of the prior, or says something else when
-    asked a second time.
-    """
-    scene, prior_px = first.scene, float(first.scene.camera_matrix[0, 0])
-    told = focal_of_clip(scene.info, first.followed[0], WORKING_SIDE_PX)
-    if told is None:
-        return first, {"source": "prior"}
-    said = {"told_focal_px": round(prior_px * told.factor, 1), "told_std_px": round(prior_px * told.std, 1)}
-    refused = first, {"source": "prior", **said}
-    if not (told.trusted(told.factor) and told.contradicts):
-        return refused
-    report(0, scene.info.frame_count, "following again, with the focal length that the clip tells")
-    scene = replace(scene, camera_matrix=scaled_focal(scene.camera_matrix, told.factor))
-    elsewhere = first.starts[0].box_source == "followed"
-    there = [scaled(start.best.box, 1 / scene.start_scale) for start in first.starts]
-    try:
-        starts = _find_in(first.sharp, scene, requests, models, there if elsewhere else None)
-    except NotFoundError:
-        return refused
-    second = _attempt(scene, first.index, first.sharp, starts, report, watch_camera)
-    again = focal_of_clip(scene.info, second.followed[0], WORKING_SIDE_PX, told.factor)
-    if again is None or not told.agree(again) or second.sure < first.sure - LESS_SURE:
-        return refused
-    focal_px = float(scene.camera_matrix[0, 0])
-    # What it would still change is as uncertain as what it is sure of.
-    std_px = focal_px * float(np.hypot(again.log_std, np.log(again.factor)))
-    return second, {"source": "estimated", "focal_px": round(focal_px, 1), "std_px": round(std_px, 1)}
-
-
-def _found(
-    scene: _Scene, requests: Sequence[ObjectRequest], models: Sequence[list[Model]], start_frame: int | None
-) -> Iterator[tuple[int, Image, list[Start]]]:
-    """The start frame, its picture at starting size and the objects in it; then others that may show them better.
-
-    Others only where nobody said which frame. Raises UserError when the objects are in none of them.
-    """
-    first, found = start_frame or 0, False
-    refusal: NotFoundError | None = None
-    wanted = [first]
-    if start_frame is None and not any(request.pointed_at for request in requests):
-        wanted += [k for k in OTHER_FRAMES if k < scene.info.frame_count]
-    for index in wanted:
-        frames = iterate_frames(scene.info.path, STARTING_SIDE_PX, scene.info)
-        frame = next((frame for frame in frames if frame.index == index), None)
-        if frame is None:  # damaged
-            continue
-        try:
-            starts = _find_in(frame.rgb, scene, requests, models)
-        except NotFoundError as error:
-            refusal = refusal or error
-            continue
-        found = True
-        yield frame.index, frame.rgb, starts
-    if not found:
-        where = f"in frame {first} of {scene.info.path}"
-        raise UserError(f"{refusal} {where}; give its box there with --box X Y WIDTH HEIGHT, or another --start-frame")
-
-
-def _find_in(
-    sharp: Image,
-    scene: _Scene,
-    requests: Sequence[ObjectRequest],
-    models: Sequence[list[Model]],
-    followed_to: Sequence[Box] | None = None,
-) -> list[Start]:
-    """The objects in a frame. followed_to: boxes in px of the video around where they were followed to, if so."""
-    info, small = scene.info, _small(sharp, scene)
-    labels = None if scene.background is None else scene.background.labels(small)
-    # What moved at any time, or, better, what covers something that was seen at another time.
-    moved = motion_since(small, scene.samples) if labels is None else np.array(COVERED)[labels]
-    starts: list[Start] = []
-    camera = scene.camera(scene.start_scale)
-    for number, (request, candidates) in enumerate(zip(requests, models, strict=True)):
-        mask = None
-        if followed_to is not None:
-            seen = check_box(followed_to[number], info.width_px, info.height_px)
-            boxes, source = [scaled(seen, scene.start_scale)], "followed"
-        elif request.mask is not None:
-            mask = resized(read_mask(request.mask, info.width_px, info.height_px), sharp)
-            boxes, source = [mask_box(mask)], "mask"
-        elif request.box_xywh_px is not None:
-            given = check_box(request.box_xywh_px, info.width_px, info.height_px)
-            boxes, source = [scaled(given, scene.start_scale)], "given"
-        else:
-            places = find_places(
-                small, moved, [m.mesh for m in candidates], scene.camera(scene.scale), labels=labels,
-                handled=len(starts) == 0, taken=[resized(s.best.mask, small) for s in starts],
-            )  # fmt: skip
-            boxes, source = [scaled(place, scene.start_scale / scene.scale) for place in places], "found"
-        starts.append(start_object(request, candidates, sharp, boxes, source, camera, mask, labels))
-    return starts
-
-
-def _small(sharp: Image, scene: _Scene) -> Image:
-    """The start frame at working size."""
-    size = tuple(round(side * scene.scale) for side in (scene.info.width_px, scene.info.height_px))
-    return np.asarray(cv2.resize(sharp, size, interpolation=cv2.INTER_AREA), np.uint8)
-
-
 def _check_followed(request: ObjectRequest, start: Start, result: Followed, handled: bool, info: VideoInfo) -> None:
     """Raise UserError when what was followed cannot be the object."""
     visible = [e.visible for e in result.estimates]
@@ -353,16 +146,17 @@ def _check_followed(request: ObjectRequest, start: Start, result: Followed, hand
         seen = f"it was lost after {sum(visible)} of {len(visible)} frames"
         raise UserError(f"object {request.name!r} was not found in {info.path}: {seen}; {mend}")
     sure = float(np.mean([e.confidence for e in result.estimates]))
-    if handled and start.box_source == "found" and sure < TRUSTED_CONFIDENCE:
+    if handled and not request.pointed_at and sure < TRUSTED_CONFIDENCE:
         what = f"what looked most like it was followed with a confidence of {sure:.0%} only"
         raise UserError(f"object {request.name!r} was not found in {info.path}: {what}; {mend}")
 
 
-def _header(request: ObjectRequest, scene: _Scene, start: Start, model: Model, index: int) -> dict[str, Any]:
+def _header(request: ObjectRequest, scene: Scene, start: Start, model: Model) -> dict[str, Any]:
     box = [round(v / scene.start_scale, 1) for v in start.best.box]
     chosen = {
         "given": "the box that was given",
         "mask": "the mask that was given",
+        "widened": "in a box somewhat larger than that which was given or found: it is followed more surely so",
         "followed": "where it was followed to from another frame, most surely",
         "found": f"found: what looks most like a {model.header['name']}, differs from its surroundings and moves",
     }[start.box_source]
@@ -376,7 +170,7 @@ def _header(request: ObjectRequest, scene: _Scene, start: Start, model: Model, i
             "box_xywh_px": box,
             "box_source": start.box_source,
             "choice": chosen,
-            "start_frame": index,
+            "start_frame": start.frame,
             "working_side_px": WORKING_SIDE_PX,
             "first_frame": start.described(),
             **({} if scene.depth is None else {"depth": scene.depth.described(model.vessel is not None)}),

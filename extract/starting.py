@@ -61,13 +61,15 @@ class Hypothesis:
 class Start:
     """An object in the start frame, at the starting resolution: its explanations, best first.
 
-    box_source: "given", "mask" or "found".  box: where it was looked for.  labels: of the background, if it is known.
+    box_source: "given", "mask", "found", "followed" or "widened".  box: where it was looked for.  labels: of the
+    background, if it is known.  frame: index of the start frame in the clip.
     """
 
     hypotheses: tuple[Hypothesis, ...]
     box_source: str
     box: Box
     labels: NDArray[np.uint8] | None = None
+    frame: int = 0
 
     @property
     def best(self) -> Hypothesis:

@@ -107,12 +107,28 @@ def test_a_clip_is_followed_both_ways_from_any_frame(clip: Path, mesh_file: Path
         assert both > 0.9
 
 
+def test_what_was_followed_unsurely_is_looked_for_in_a_wider_box_as_well(
+    clip: Path, mesh_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plain = follow(clip, mesh_file, tmp_path / "plain")
+    assert plain.header["settings"]["box_source"] == "given"
+    monkeypatch.setattr("vid2demo.extract.attempts.SURELY_BEGUN", 1.1)  # nothing is
+    kept = follow(clip, mesh_file, tmp_path / "kept")  # of what is as sure the first
+    assert np.array_equal(kept.T_camera_object, plain.T_camera_object)
+    monkeypatch.setattr("vid2demo.extract.attempts.WIDER_MARGIN", -1.0)
+    track = follow(clip, mesh_file, tmp_path / "wider")
+    assert track.header["settings"]["box_source"] == "widened"
+    assert track.header["settings"]["start_frame"] == 0
+    assert off_px(track, range(COUNT)) < 4
+
+
 def test_what_was_followed_unsurely_is_followed_again_from_where_it_shows_best(
     clip: Path, mesh_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("vid2demo.extract.perceive.SURELY_FOLLOWED", 1.1)  # nothing is
-    monkeypatch.setattr("vid2demo.extract.perceive.ELSEWHERE_MARGIN", -1.0)
-    monkeypatch.setattr("vid2demo.extract.perceive.AWAY_FRAMES", 3)
+    monkeypatch.setattr("vid2demo.extract.attempts.SURELY_FOLLOWED", 1.1)  # nothing is
+    monkeypatch.setattr("vid2demo.extract.attempts.ELSEWHERE_MARGIN", -1.0)
+    monkeypatch.setattr("vid2demo.extract.attempts.AWAY_FRAMES", 3)
+    monkeypatch.setattr("vid2demo.extract.attempts.SURELY_BEGUN", 0.0)  # no wider box
     track = follow(clip, mesh_file, tmp_path)
     assert track.header["settings"]["start_frame"] > 3
     assert track.header["settings"]["box_source"] == "followed"
