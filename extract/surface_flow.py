@@ -12,12 +12,12 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from .geometry import Array
 from .point_tracks import moved_points
 from .raster import DepthWindow, render_depth
 from .region import TrackingMesh
-from .spin import spun
 
 CORNERS, APART_PX, PATCH_PX = 80, 5, 5
 LEAST_CORNER = (
@@ -28,6 +28,7 @@ FLOW_PX = 48  # most that a point moves between frames
 LEAST_POINTS, LEAST_SHARE = 8, 0.5  # that agree about a spin
 AGREE_PX = 3.0
 TRIED_RAD = np.deg2rad(np.arange(-40.0, 41.0))
+TURNS = Rotation.from_rotvec(np.outer(TRIED_RAD, [0.0, 0.0, 1.0])).as_matrix()
 
 Grey = NDArray[np.uint8]
 
@@ -87,13 +88,12 @@ def spin_by_flow(
     after_px = flow.after_px[seen]
     if len(points_m) < LEAST_POINTS:
         return None
-    agree = np.zeros(len(TRIED_RAD))
-    for k, angle_rad in enumerate(TRIED_RAD):
-        T = spun(T_after, angle_rad, axis_xy_m)
-        seen_m = points_m @ T[:3, :3].T + T[:3, 3]
-        pixels = seen_m[:, :2] / seen_m[:, 2:] * np.diag(camera_matrix)[:2] + camera_matrix[:2, 2]
-        error_px = np.linalg.norm(pixels - after_px, axis=1)
-        agree[k] = np.maximum(0.0, 1.0 - (error_px / AGREE_PX) ** 2).sum()
+    axis_m = np.array([*axis_xy_m, 0.0])
+    spun_m = np.einsum("kij,nj->kni", TURNS, points_m - axis_m) + axis_m
+    seen_m = spun_m @ T_after[:3, :3].T + T_after[:3, 3]
+    pixels = seen_m[..., :2] / seen_m[..., 2:] * np.diag(camera_matrix)[:2] + camera_matrix[:2, 2]
+    error_px = np.linalg.norm(pixels - after_px, axis=-1)
+    agree = np.maximum(0.0, 1.0 - (error_px / AGREE_PX) ** 2).sum(axis=1)
     best = int(np.argmax(agree))
     if agree[best] < max(LEAST_POINTS, LEAST_SHARE * len(points_m)):
         return None
