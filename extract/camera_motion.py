@@ -6,11 +6,14 @@ small sway is near enough to the first, a moving one in a deep scene is neither,
 frame has lost its corners the present frame takes its place; homographies are chained over key frames, not frames.
 Corners that are left keep their numbers, and where each was seen is kept for `camera_path`, which tells how the camera
 moved through such a scene: everything in frames that show something new, a few dozen in those between.
+
+While the camera stands, only some frames are looked at. Where one of them shows that it has moved, those before it
+that were passed over are gone through after all, so that no motion begins late.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import cv2
@@ -33,6 +36,7 @@ OBJECT_MARGIN = 0.15  # of the box, left out around it: hands and shadows move w
 NEW_VIEW_SHARE = 0.02  # of the longer side, that corners have moved since the last frame of which everything is kept
 STANDS_SHARE = 0.9  # of the corners, far and near, that have not moved: then the camera has not
 KEPT_BETWEEN = 60  # corners of a frame between those
+CALM_FRAMES, LOOK_EVERY = 12, 6  # a camera that stood so long is looked at in every sixth frame, until it moves
 TURN_SHARE = 0.85  # of the corners that fit a homography: when so many fit a rotation too, it is a rotation
 
 
@@ -97,7 +101,7 @@ class CameraWatch:
     """Watches the background of a clip frame by frame; `result` may be asked for at any time.
 
     camera_matrix: (3, 3) at the size of the frames given to `step`. Of each frame its homography is kept, and its
-    `sightings`: None where no corner could be followed.
+    `sightings`: None where no corner could be followed; complete when `result` has been asked for.
     """
 
     camera_matrix: Array
@@ -111,6 +115,8 @@ class CameraWatch:
     _quality: list[tuple[float, float]] = field(default_factory=list)
     _view: Sighting | None = None
     _next_id: int = 0
+    _calm: int = 0  # frames that it has stood for
+    _passed: list[tuple[Image, Mask | None, list[Box]]] = field(default_factory=list)  # over, and the one at hand
 
     @property
     def working_camera(self) -> Array:
@@ -124,11 +130,38 @@ class CameraWatch:
         """
         self._scale = min(1.0, WORKING_SIDE_PX / max(rgb.shape[:2]))
         self._shape = (rgb.shape[0], rgb.shape[1])
+        self._passed.append((rgb, leave_out, boxes or []))
+        if self._calm < CALM_FRAMES or len(self._passed) == LOOK_EVERY:
+            self._settle()
+
+    def _settle(self) -> None:
+        """Look at the last frame, and at those passed over before it if the camera does not stand there any more."""
+        passed, self._passed = self._passed, []
+        if len(passed) > 1:
+            assert self._key is not None
+            histories: list[list[Any]] = [self._H, self._R, self._quality, self.sightings]
+            known = len(self._H)
+            kept = replace(self._key), self._before, self._view, self._next_id
+            self._look(*passed[-1])
+            if self._calm:
+                self._calm += len(passed) - 1
+                for history in histories:
+                    history += history[known:] * (len(passed) - 1)
+                return
+            self._key, self._before, self._view, self._next_id = kept
+            for history in histories:
+                del history[known:]
+        for frame in passed:
+            self._look(*frame)
+
+    def _look(self, rgb: Image, leave_out: Mask | None, boxes: list[Box]) -> None:
+        """What one frame tells, against those before it."""
         grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
         if self._scale < 1.0:
             grey = cv2.resize(grey, None, fx=self._scale, fy=self._scale, interpolation=cv2.INTER_AREA)
         image = np.asarray(grey, np.uint8)
-        background = self._background(image, leave_out, boxes or [])
+        background = self._background(image, leave_out, boxes)
+        key, seen = self._key, self._view
         H, R, quality, turn_quality = np.eye(3), np.eye(3), 1.0, 1.0
         if self._key is not None and self._before is not None:
             H, R, quality, turn_quality = self._followed(self._key, self._before, image, background)
@@ -139,9 +172,12 @@ class CameraWatch:
         self._H.append(H)
         self._R.append(R)
         self._quality.append((quality, turn_quality))
+        stands = key is self._key and key is not None and H is key.H_key_first and self.sightings[-1] is seen
+        self._calm = self._calm + 1 if stands else 0
 
     def result(self) -> CameraMotion:
         """The motion so far. Raises ValueError before the first frame."""
+        self._settle()
         if not self._H:
             raise ValueError("no frame was watched")
         up = np.diag([1 / self._scale, 1 / self._scale, 1.0])

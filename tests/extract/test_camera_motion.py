@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from vid2demo.extract.camera_motion import CameraMotion, CameraWatch
+from vid2demo.extract.camera_motion import CALM_FRAMES, LOOK_EVERY, CameraMotion, CameraWatch
 from vid2demo.extract.geometry import focal_prior_camera_matrix, invert_pose, make_pose, rotation_angle_rad
 from vid2demo.extract.video import iterate_frames
 
@@ -139,6 +139,26 @@ def test_corners_keep_their_numbers_and_standing_frames_share_theirs() -> None:
         moved = sighting.pixels[b] - first.pixels[a]
         assert np.median(moved, axis=0) == pytest.approx([shift, 0], abs=0.1)
         assert np.mean(np.abs(moved - [shift, 0]) < 0.5) > 0.97
+
+
+def test_no_motion_begins_late_after_the_camera_has_stood() -> None:
+    """Of a standing camera only some frames are looked at; those passed over before it moves are gone through."""
+    begins = CALM_FRAMES + 2 * LOOK_EVERY + LOOK_EVERY // 2
+    shifts = np.maximum(0.0, 3.0 * (np.arange(begins + 2 * LOOK_EVERY + 1) - begins))
+    watch = CameraWatch(K)
+    for k, shift in enumerate(shifts):
+        watch.step(seen(np.array([[1, 0, shift], [0, 1, 0], [0, 0, 1]]), k), boxes=[(BOX[0] - 3 * k, *BOX[1:])])
+    motion = watch.result()
+    assert len(motion.quality) == len(watch.sightings) == len(shifts)
+    middle = motion.H_frame_first @ [WIDTH / 2, HEIGHT / 2, 1.0]
+    assert middle[:, 0] / middle[:, 2] == pytest.approx(WIDTH / 2 + shifts, abs=1.0)  # of 3 px a frame
+    assert all(sighting is watch.sightings[0] for sighting in watch.sightings[:begins])
+    for sighting, shift in zip(watch.sightings[begins:], shifts[begins:], strict=True):
+        first = watch.sightings[0]
+        assert first is not None
+        assert sighting is not None
+        _, a, b = np.intersect1d(first.ids, sighting.ids, return_indices=True)
+        assert np.median(sighting.pixels[b] - first.pixels[a], axis=0) == pytest.approx([shift, 0], abs=0.1)
 
 
 @needs_data
