@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from .geometry import Array, extent, project, transform_points
 
 FAR_M = np.float32(1e30)  # of pixels where nothing was drawn yet
+WAITING = 2048  # rows of triangles that are listed before they are drawn
+LEAST_SLOPE = 1e-12  # of a barycentric weight along a row: what changes less does not change
 
 
 @dataclass(frozen=True)
@@ -96,42 +98,68 @@ def render_depth(
 
 @numba.njit(cache=True, fastmath=True)
 def _fill(uv: Array, z: Array, faces: NDArray[np.int32], closed: bool, depth: NDArray[np.float32]) -> None:
-    """Z-buffer with 1/z interpolated linearly on the image plane, which is exact for planes in perspective."""
+    """Z-buffer with 1/z interpolated linearly on the image plane, which is exact for planes in perspective.
+
+    Triangles are small: rows of them are listed first and drawn later, because a processor that waits for every row's
+    ends before it knows how many pixels to draw spends most of its time waiting.
+    """
     h, w = depth.shape
     depth[:] = FAR_M
+    pixels = depth.reshape(h * w)
     inverse = 1.0 / z
+    place, count = np.empty(WAITING + h, np.int64), np.empty(WAITING + h, np.int64)
+    begin, along = np.empty(WAITING + h), np.empty(WAITING + h)
+    rows = 0
     for f in range(faces.shape[0]):
+        if rows > WAITING:
+            _draw_rows(place[:rows], count, begin, along, pixels)
+            rows = 0
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
         ax, ay, bx, by, cx, cy = uv[a, 0], uv[a, 1], uv[b, 0], uv[b, 1], uv[c, 0], uv[c, 1]
         area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
-        if abs(area) < 1e-12 or (closed and area > 0.0):
-            continue
         x_a = max(int(np.ceil(min(ax, bx, cx))), 0)
         x_b = min(int(np.floor(max(ax, bx, cx))), w - 1)
         y_a = max(int(np.ceil(min(ay, by, cy))), 0)
         y_b = min(int(np.floor(max(ay, by, cy))), h - 1)
-        if x_a > x_b or y_a > y_b:
+        if (x_a > x_b) | (y_a > y_b) | (abs(area) < 1e-12) | (closed & (area > 0.0)):
             continue
         # Barycentric weights of a, b and c change by these from pixel to pixel, and 1/z by the last.
-        slope_u, slope_v = (by - cy) / area, (cy - ay) / area
+        scale = 1.0 / area
+        slope_u, slope_v = (by - cy) * scale, (cy - ay) * scale
         slope_s = -slope_u - slope_v
         rise_a, rise_b = inverse[a] - inverse[c], inverse[b] - inverse[c]
         slope = slope_u * rise_a + slope_v * rise_b
+        slope_u = slope_u if abs(slope_u) > LEAST_SLOPE else LEAST_SLOPE
+        slope_v = slope_v if abs(slope_v) > LEAST_SLOPE else LEAST_SLOPE
+        slope_s = slope_s if abs(slope_s) > LEAST_SLOPE else LEAST_SLOPE
+        per_u, per_v, per_s = 1.0 / slope_u, 1.0 / slope_v, 1.0 / slope_s
+        longest = float(x_b - x_a)
         for y in range(y_a, y_b + 1):
-            u = ((bx - x_a) * (cy - y) - (by - y) * (cx - x_a)) / area
-            v = ((cx - x_a) * (ay - y) - (cy - y) * (ax - x_a)) / area
-            first, last = 0.0, float(x_b - x_a)
-            for weight, change in ((u, slope_u), (v, slope_v), (1.0 - u - v, slope_s)):
-                if change > 0.0:
-                    first = max(first, (-1e-9 - weight) / change)
-                elif change < 0.0:
-                    last = min(last, (-1e-9 - weight) / change)
-                elif weight < -1e-9:
-                    last = -1.0
-            d = inverse[c] + u * rise_a + v * rise_b
-            for i in range(int(np.ceil(first)), int(np.floor(last)) + 1):
-                depth[y, x_a + i] = min(depth[y, x_a + i], np.float32(1.0 / (d + i * slope)))
-    for y in range(h):
-        for x in range(w):
-            if depth[y, x] == FAR_M:
-                depth[y, x] = 0.0
+            u = ((bx - x_a) * (cy - y) - (by - y) * (cx - x_a)) * scale
+            v = ((cx - x_a) * (ay - y) - (cy - y) * (ax - x_a)) * scale
+            # Where the weights pass zero: those that rise begin the row, those that fall end it.
+            at_u, at_v, at_s = (-1e-9 - u) * per_u, (-1e-9 - v) * per_v, (u + v - 1.0 - 1e-9) * per_s
+            first = max(at_u if slope_u > 0.0 else 0.0, at_v if slope_v > 0.0 else 0.0)
+            first = np.ceil(max(first, at_s if slope_s > 0.0 else 0.0, 0.0))
+            last = min(at_u if slope_u < 0.0 else longest, at_v if slope_v < 0.0 else longest)
+            last = np.floor(min(last, at_s if slope_s < 0.0 else longest, longest))
+            place[rows] = y * w + x_a + int(first)
+            count[rows] = int(last - first) + 1
+            begin[rows] = inverse[c] + u * rise_a + v * rise_b + first * slope
+            along[rows] = slope
+            rows += last >= first
+    _draw_rows(place[:rows], count, begin, along, pixels)
+    for i in range(h * w):
+        if pixels[i] == FAR_M:
+            pixels[i] = 0.0
+
+
+@numba.njit(cache=True, fastmath=True)
+def _draw_rows(
+    place: NDArray[np.int64], count: NDArray[np.int64], begin: Array, along: Array, pixels: NDArray[np.float32]
+) -> None:
+    """Draw rows of `count` pixels (N,) from `place` in flat `pixels` on; 1/z begins with `begin`, changes `along`."""
+    for k in range(place.shape[0]):
+        for i in range(count[k]):
+            at = place[k] + i
+            pixels[at] = min(pixels[at], np.float32(1.0 / (begin[k] + i * along[k])))
