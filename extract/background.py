@@ -15,10 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .geometry import Array
-from .video import Image
+from .video import Image, softened
 
 SAMPLES = 24
-BLUR_PX = 1.0
 RIM = 5  # px, of the square by which what is covered shrinks
 SAME_LEVELS = 12.0  # grey levels, of a channel, by which what is the same may differ: noise, compression
 SHADOW_LEVELS = 9.0  # by which a shadow may differ from the background made darker
@@ -40,14 +39,15 @@ class Background:
     rgb: Image
     known: NDArray[np.bool_]
 
-    def labels(self, rgb: Image) -> NDArray[np.uint8]:
+    def labels(self, rgb: Image, soft: Image | None = None) -> NDArray[np.uint8]:
         """(H, W) what every pixel of a frame shows: FOREGROUND, BACKGROUND, or SHADOW: the same but darker.
 
         FOREGROUND also stands for what cannot be told. A change of the light as a whole is allowed for.
+        soft: the frame `softened`, if it is at hand.
         """
         out = np.empty(rgb.shape[:2], np.uint8)
-        gain = _gain(rgb, self.rgb, self.known)
-        _label(_soft(rgb), self.rgb, self.known, gain, DARKEST, SAME_LEVELS, SHADOW_LEVELS, out)
+        gain, soft = _gain(rgb, self.rgb, self.known), softened(rgb) if soft is None else soft
+        _label(soft, self.rgb, self.known, gain, DARKEST, SAME_LEVELS, SHADOW_LEVELS, out)
         return out
 
     def part(self, x_a: int, y_a: int, x_b: int, y_b: int) -> Background:
@@ -55,12 +55,12 @@ class Background:
         window = np.s_[y_a:y_b, x_a:x_b]
         return Background(np.ascontiguousarray(self.rgb[window]), np.ascontiguousarray(self.known[window]))
 
-    def covered(self, rgb: Image) -> NDArray[np.bool_]:
+    def covered(self, rgb: Image, soft: Image | None = None) -> NDArray[np.bool_]:
         """(H, W) where something stands before a background that is known there, surely: not along its rim.
 
-        There colours mix and labels, which are those of a blurred picture, reach too far.
+        There colours mix and labels, which are those of a blurred picture, reach too far.  soft: see `labels`.
         """
-        covered = self.known & (self.labels(rgb) == FOREGROUND)
+        covered = self.known & (self.labels(rgb, soft) == FOREGROUND)
         return np.asarray(cv2.erode(covered.astype(np.uint8), np.ones((RIM, RIM), np.uint8)) > 0)
 
 
@@ -88,11 +88,11 @@ def learn_background(frames: Sequence[Image]) -> Background | None:
     """
     if len(frames) < 4:
         return None
-    first = _soft(frames[0])
+    first = softened(frames[0])
     everywhere = np.ones(first.shape[:2], bool)
     stack = [first]
     for rgb in frames[1:]:
-        soft = _soft(rgb)
+        soft = softened(rgb)
         stack.append(np.asarray(np.clip(soft / _gain(soft, first, everywhere), 0, 255), np.uint8))
     modes, share, when = _two_modes(np.stack(stack), SAME_LEVELS)
     edges = cv2.Sobel(modes[0], cv2.CV_32F, 1, 0) ** 2 + cv2.Sobel(modes[0], cv2.CV_32F, 0, 1) ** 2
@@ -148,18 +148,31 @@ def _second_is_background(modes: Image, settled: NDArray[np.bool_], when: NDArra
     return out
 
 
-def _soft(rgb: Image) -> Image:
-    return np.asarray(cv2.GaussianBlur(rgb, (0, 0), BLUR_PX), np.uint8)
-
-
 def _gain(rgb: Image, reference: Image, known: NDArray[np.bool_]) -> Array:
     """(3,) by how much brighter each channel of a picture is than the same place of another, most places agreeing."""
-    step = np.s_[::GAIN_STRIDE, ::GAIN_STRIDE]
-    a, b = rgb[step][known[step]].astype(float), reference[step][known[step]].astype(float)
-    usable = ((a > 16) & (a < 245) & (b > 16) & (b < 245)).all(axis=1)
-    if np.count_nonzero(usable) < 50:
+    ratios = np.empty((3, -(-rgb.shape[0] // GAIN_STRIDE) * -(-rgb.shape[1] // GAIN_STRIDE)))
+    count = _ratios(rgb, reference, known, GAIN_STRIDE, ratios)
+    if count < 50:
         return np.ones(3)
-    return np.asarray(np.clip(np.median(a[usable] / b[usable], axis=0), *GAIN_LIMITS))
+    return np.asarray(np.clip(np.median(ratios[:, :count], axis=1), *GAIN_LIMITS))
+
+
+@numba.njit(cache=True)
+def _ratios(
+    rgb: NDArray[np.uint8], reference: NDArray[np.uint8], known: NDArray[np.bool_], stride: int, ratios: Array
+) -> int:
+    """How many of the known pixels, `stride` apart, are neither dark nor white, and their ratios into (3, N)."""
+    count = 0
+    for y in range(0, rgb.shape[0], stride):
+        for x in range(0, rgb.shape[1], stride):
+            usable = known[y, x]
+            for c in range(3):
+                usable &= 16 < rgb[y, x, c] < 245 and 16 < reference[y, x, c] < 245
+            if usable:
+                for c in range(3):
+                    ratios[c, count] = rgb[y, x, c] / reference[y, x, c]
+                count += 1
+    return count
 
 
 @numba.njit(cache=True)
@@ -225,20 +238,25 @@ def _label(
     rgb: NDArray[np.uint8], background: NDArray[np.uint8], known: NDArray[np.bool_], gain: Array, darkest: float,
     same: float, shadow_same: float, out: NDArray[np.uint8],
 ) -> None:  # fmt: skip
-    for y in range(rgb.shape[0]):
-        for x in range(rgb.shape[1]):
+    h, w, _ = rgb.shape
+    off_by, gains = np.empty(3 * w), np.empty(3 * w)
+    for i in range(3 * w):
+        gains[i] = gain[i % 3]
+    for y in range(h):
+        seen_row, expected_row = rgb[y].reshape(3 * w), background[y].reshape(3 * w)
+        for i in range(3 * w):
+            off_by[i] = abs(seen_row[i] - gains[i] * expected_row[i])
+        for x in range(w):
             out[y, x] = FOREGROUND
             if not known[y, x]:
                 continue
-            off, seen, expected = 0.0, 0.0, 0.0
-            for c in range(3):
-                b = gain[c] * background[y, x, c]
-                off = max(off, abs(rgb[y, x, c] - b))
-                seen += rgb[y, x, c]
-                expected += b
-            if off < same:
+            if max(off_by[3 * x], off_by[3 * x + 1], off_by[3 * x + 2]) < same:
                 out[y, x] = BACKGROUND
                 continue
+            seen, expected = 0.0, 0.0
+            for c in range(3):
+                seen += rgb[y, x, c]
+                expected += gain[c] * background[y, x, c]
             ratio = seen / max(expected, 1.0)
             if ratio >= 1.0 or ratio < darkest:
                 continue

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .region_kernels import count_bins, smooth_histogram
+from .region_kernels import count_bins, hide_bins, smooth_histogram
 from .video import Image
 
 BITS = 4  # colour resolution per channel of the local histograms
@@ -63,20 +63,22 @@ class ColourModel:
 
         That is, whose colours are less than `odds` times as likely the object's as those of what may hide it.
         """
-        alien = self.foreground[-1] + 1e-5 < odds * (self.hiding + 1e-5)
-        return np.asarray(covered & alien[bins])
+        return np.asarray(covered & self._alien(odds)[bins])
+
+    def _alien(self, odds: float) -> NDArray[np.bool_]:
+        """(BINS,) which colours are less than `odds` times as likely the object's as those of what may hide it."""
+        return np.asarray(self.foreground[-1] + 1e-5 < odds * (self.hiding + 1e-5))
 
     def hide(self, bins: NDArray[np.int32], covered: NDArray[np.bool_]) -> None:
         """Blank in `bins` (H, W) what hides the object.
 
         Whether the object goes on behind it is not known, so that it must not speak for the background.
         """
-        hidden = self.hides(bins, covered, LEAST_ODDS)
-        fresh = np.bincount(bins[hidden], minlength=BINS).astype(np.float32)
+        fresh = np.zeros(BINS, np.float32)
+        hide_bins(bins, covered, self._alien(LEAST_ODDS), HIDDEN_BIN, fresh)
         if fresh.any():
             smooth_histogram(fresh, 1 << BITS)
             self.hiding += HIDING_RATE * (fresh - self.hiding)
-        bins[hidden] = HIDDEN_BIN
 
 
 def mask_evidence(

@@ -55,9 +55,8 @@ class Creases:
         """
         pixel, normal = self.seen(T_camera_object, camera_matrix)
         mean_px, variance = np.zeros(len(pixel)), np.zeros(len(pixel))
-        _measure(pixel, normal, edges, step_px, mean_px, variance)
-        x, y = np.clip(np.round(pixel), 0, [told.shape[1] - 1, told.shape[0] - 1]).astype(int).T
-        kept = (variance > 0) & told[y, x]
+        _measure(pixel, normal, edges, told, step_px, mean_px, variance)
+        kept = variance > 0
         target = pixel[kept] + mean_px[kept, None] * normal[kept]
         return self.point_object_m[kept], target, normal[kept], variance[kept]
 
@@ -159,16 +158,19 @@ def find_creases(
 
 @numba.njit(cache=True)
 def _measure(
-    pixel: Array, normal: Array, edges: NDArray[np.float32], step_px: float, mean_px: Array, variance: Array
-) -> None:
+    pixel: Array, normal: Array, edges: NDArray[np.float32], told: NDArray[np.bool_], step_px: float,
+    mean_px: Array, variance: Array,
+) -> None:  # fmt: skip
     """Posterior mean and variance (N,) in px of each crease along its line, by the image edges (H, W, 2) there.
 
-    variance 0 marks a line without a clear edge.
+    variance 0 marks a line without a clear edge, or where `told` (H, W) is false.
     """
     h, w = edges.shape[:2]
     count = int(max(REACH * step_px, REACH_PX))
     for i in range(pixel.shape[0]):
         variance[i] = 0.0
+        if not told[min(max(round(pixel[i, 1]), 0), h - 1), min(max(round(pixel[i, 0]), 0), w - 1)]:
+            continue
         weight, first, second, strongest = 0.0, 0.0, 0.0, 0.0
         for d in range(-count, count + 1):
             x = round(pixel[i, 0] + d * normal[i, 0])

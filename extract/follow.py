@@ -31,7 +31,7 @@ from .spin import HIDDEN_EVIDENCE, SURELY_OURS, best_turns, object_evidence, tur
 from .surface_flow import CarriedPoints, SurfaceFlow, spin_by_flow
 from .tracker import Estimate, ObjectTracker
 from .vessels import Vessel
-from .video import Image
+from .video import Image, softened
 
 GLIMPSES = 30  # frames kept for the spin
 FIT_VIEWS = 6  # frames that the shape is fitted to
@@ -126,12 +126,13 @@ class Followed:
                 self.carried = CarriedPoints(grey, seen.mask_in_image(rgb.shape[1], rgb.shape[0]))
 
     def _glimpse(self, rgb: Image, index: int, depth: DepthView | None, whole: bool) -> Glimpse:
-        bins, edges, colours = colour_bins(rgb), edge_strength(rgb), self.tracker.colours
+        bins, soft, colours = colour_bins(rgb), softened(rgb), self.tracker.colours
+        edges = edge_strength(rgb, soft)
         evidence = object_evidence(bins, colours)
         strength = np.minimum(np.sqrt(edges[..., 0] ** 2 + edges[..., 1] ** 2), 1.0)
         near_edge = np.asarray(cv2.dilate(strength, np.ones((5, 5), np.uint8)), np.float32)
         if self.tracker.background is not None:
-            covered = self.tracker.background.covered(rgb)
+            covered = self.tracker.background.covered(rgb, soft)
             hidden = colours.hides(bins, covered, SURELY_OURS)
             evidence[hidden], near_edge[hidden] = HIDDEN_EVIDENCE, -1.0
             colours.hide(bins, covered)

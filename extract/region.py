@@ -22,7 +22,7 @@ from .creases import Creases, draw_creases
 from .geometry import Array, invert_pose, make_pose, project, shows_same_side, transform_points
 from .raster import render_depth
 from .region_kernels import free_lengths, learn_lines, measure_lines, solve_pose, strongest_gradient
-from .video import Image
+from .video import Image, softened
 
 CLEAR_EDGE = 24.0  # grey levels per px
 SAME_SIDE_RAD, SAME_SIZE = float(np.deg2rad(1.5)), 0.05  # of views that one outline serves
@@ -84,7 +84,8 @@ class Outline:
         """The lines whose feet are in an image (height, width); None when fewer than 12 are."""
         x, y = self.pixel.T
         keep = (x >= 2) & (x < image_shape[1] - 2) & (y >= 2) & (y < image_shape[0] - 2)
-        return self.select(keep) if np.count_nonzero(keep) >= 12 else None
+        count = np.count_nonzero(keep)
+        return None if count < 12 else self if count == len(keep) else self.select(keep)
 
     def teach(self, colours: ColourModel, bins: NDArray[np.int32], rate: float) -> None:
         """Let colours learn from the lines of an outline that fits; `bins` is the (H, W) image of colour bins."""
@@ -123,12 +124,13 @@ class Points:
         return np.asarray(np.linalg.norm(seen - self.pixel, axis=1))
 
 
-def edge_strength(rgb: Image) -> NDArray[np.float32]:
-    """(H, W, 2) image gradient, the largest of the three channels, scaled so that a clear edge has length 1."""
+def edge_strength(rgb: Image, soft: Image | None = None) -> NDArray[np.float32]:
+    """(H, W, 2) image gradient, the largest of the three channels, scaled so that a clear edge has length 1.
+
+    soft: the image `softened`, if it is at hand.
+    """
     strength = np.empty((*rgb.shape[:2], 2), np.float32)
-    soft = cv2.GaussianBlur(rgb, (0, 0), 1.0)
-    gx, gy = (np.asarray(cv2.Sobel(soft, cv2.CV_16S, dx, 1 - dx), np.int16) for dx in (1, 0))
-    strongest_gradient(gx, gy, 1 / (8 * CLEAR_EDGE), strength)
+    strongest_gradient(softened(rgb) if soft is None else soft, 1 / (8 * CLEAR_EDGE), strength)
     return strength
 
 
@@ -302,7 +304,7 @@ def refine(
             points.object_m, points.pixel, weight, POINT_LIMIT_PX, camera_matrix, T_start, prior, iterations,
             turn, shift, found,
         )  # fmt: skip
-        return make_pose(Rotation.from_matrix(turn).as_matrix(), shift), found, float(cost)
+        return make_pose(Rotation.from_matrix(turn, assume_valid=True).as_matrix(), shift), found, float(cost)
 
     for number, step_px in enumerate(steps_px):
         if outline is None or not outline.serves(T):

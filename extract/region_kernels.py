@@ -17,7 +17,9 @@ HALF_LINE = 10  # samples on either side of the outline
 EDGE_WEIGHT, EDGE_FLOOR, EDGE_STEP_PX = 1.0, 0.2, 2.0
 HIDDEN = 0.01  # of the distance: farther behind the visible surface is another one
 AMPLITUDE, SLOPE = 0.40, 1.0  # of the smooth step between inside and outside (SRT3D, eq. 13)
-INSIDE_SHARE = 0.5 - AMPLITUDE * np.tanh(np.arange(-2 * HALF_LINE, 2 * HALF_LINE + 1) / (2.0 * SLOPE))
+# Of samples from the farthest outside of an outline to the farthest inside of it.
+INSIDE_SHARE = 0.5 - AMPLITUDE * np.tanh(np.arange(2 * HALF_LINE, -2 * HALF_LINE - 1, -1) / (2.0 * SLOPE))
+OUTSIDE_SHARE = 1.0 - INSIDE_SHARE
 
 
 @numba.njit(cache=True)
@@ -63,19 +65,51 @@ def count_bins(lab: NDArray[np.uint8], bits: int, chroma_step: int, bins: NDArra
 
 
 @numba.njit(cache=True)
-def strongest_gradient(gx: NDArray[np.int16], gy: NDArray[np.int16], scale: float, out: NDArray[np.float32]) -> None:
-    """The gradient times `scale` of the channel where it is longest, (H, W, 2); 0 at the image's border.
+def hide_bins(
+    bins: NDArray[np.int32], covered: NDArray[np.bool_], alien: NDArray[np.bool_], hidden: int,
+    counts: NDArray[np.float32],
+) -> None:  # fmt: skip
+    """Put `hidden` where `bins` (H, W) are covered and of an alien colour, and count those colours.
 
-    gx, gy: (H, W, 3) differences along x and y, such as Sobel's.
+    alien: (BINS,) by bin.  counts: (BINS,), added to.
     """
-    for y in range(gx.shape[0]):
-        for x in range(gx.shape[1]):
-            best, k = -1, 0
-            for c in range(3):
-                square = gx[y, x, c] * gx[y, x, c] + gy[y, x, c] * gy[y, x, c]
-                if square > best:
-                    best, k = square, c
-            out[y, x, 0], out[y, x, 1] = gx[y, x, k] * scale, gy[y, x, k] * scale
+    for y in range(bins.shape[0]):
+        for x in range(bins.shape[1]):
+            if covered[y, x] and alien[bins[y, x]]:
+                counts[bins[y, x]] += np.float32(1.0)
+                bins[y, x] = hidden
+
+
+@numba.njit(cache=True)
+def look_up(table: NDArray[np.float32], bins: NDArray[np.int32], out: NDArray[np.float32]) -> None:
+    """What a table (BINS,) has for every bin, into `out`, which is of their shape (H, W)."""
+    for y in range(bins.shape[0]):
+        for x in range(bins.shape[1]):
+            out[y, x] = table[bins[y, x]]
+
+
+@numba.njit(cache=True)
+def strongest_gradient(soft: NDArray[np.uint8], scale: float, out: NDArray[np.float32]) -> None:
+    """Sobel's gradient times `scale` of the channel where it is longest, (H, W, 2); 0 at the image's border.
+
+    soft: (H, W, 3).
+    """
+    h, w, _ = soft.shape
+    rows, n = soft.reshape(h, 3 * w), 3 * (w - 2)
+    gx, gy, square = np.empty(n, np.int32), np.empty(n, np.int32), np.empty(n, np.int32)
+    for y in range(1, h - 1):
+        a, b, c = rows[y - 1], rows[y - 1, 3:], rows[y - 1, 6:]
+        d, e = rows[y], rows[y, 6:]
+        f, g, k = rows[y + 1], rows[y + 1, 3:], rows[y + 1, 6:]
+        for i in range(n):
+            down, up = np.int32(k[i]) - np.int32(a[i]), np.int32(f[i]) - np.int32(c[i])
+            gx[i] = down - up + 2 * (np.int32(e[i]) - np.int32(d[i]))
+            gy[i] = down + up + 2 * (np.int32(g[i]) - np.int32(b[i]))
+            square[i] = gx[i] * gx[i] + gy[i] * gy[i]
+        for x in range(w - 2):
+            i = 3 * x + (square[3 * x + 1] > square[3 * x])
+            i = 3 * x + 2 if square[3 * x + 2] > square[i] else i
+            out[y, x + 1, 0], out[y, x + 1, 1] = gx[i] * scale, gy[i] * scale
     out[0], out[-1], out[:, 0], out[:, -1] = 0.0, 0.0, 0.0, 0.0
 
 
@@ -170,6 +204,7 @@ def measure_lines(
     n = 2 * HALF_LINE + 1
     p_f = np.empty(n)
     log_p = np.empty(n)
+    product = np.empty(n)
     use_edges = edges.shape[0] > 0 and step_px <= EDGE_STEP_PX
     for i in range(pixel.shape[0]):
         variance[i] = 0.0
@@ -197,14 +232,15 @@ def measure_lines(
             valid += 1
         if valid < HALF_LINE:
             continue
+        # One logarithm of the product: 21 factors above 0.05 are far from underflow.
+        product[:] = 1.0
+        for j in range(n):
+            inside_share, outside_share = INSIDE_SHARE[n - 1 - j :], OUTSIDE_SHARE[n - 1 - j :]
+            for d in range(n):
+                product[d] *= inside_share[d] * p_f[j] + outside_share[d] * (1.0 - p_f[j])
         top = -1e30
         for d in range(n):
-            # One logarithm of the product: 21 factors above 0.05 are far from underflow.
-            product = 1.0
-            for j in range(n):
-                inside_share = INSIDE_SHARE[j - d + 2 * HALF_LINE]
-                product *= inside_share * p_f[j] + (1.0 - inside_share) * (1.0 - p_f[j])
-            total = np.log(product)
+            total = np.log(product[d])
             if use_edges:
                 r = (d - HALF_LINE) * step_px
                 x = round(pixel[i, 0] + r * normal[i, 0])
@@ -334,22 +370,27 @@ def draw_view(
     h, w = drawn.shape
     kh, kw = key_picture.shape
     fx, fy, cx, cy = camera_matrix[0, 0], camera_matrix[1, 1], camera_matrix[0, 2], camera_matrix[1, 2]
-    for j in range(depth.shape[0]):
+    key_fx, key_fy, key_cx, key_cy = key_camera[0, 0], key_camera[1, 1], key_camera[0, 2], key_camera[1, 2]
+    # Numbers of its own each: those in arrays would be read again for every pixel.
+    xx, xy, xz, tx = T_key_camera[0, 0], T_key_camera[0, 1], T_key_camera[0, 2], T_key_camera[0, 3]
+    yx, yy, yz, ty = T_key_camera[1, 0], T_key_camera[1, 1], T_key_camera[1, 2], T_key_camera[1, 3]
+    zx, zy, zz, tz = T_key_camera[2, 0], T_key_camera[2, 1], T_key_camera[2, 2], T_key_camera[2, 3]
+    across = np.empty(depth.shape[1])
+    for i in range(depth.shape[1]):
+        across[i] = (i + x0 - cx) / fx
+    for j in range(max(0, -y0), min(depth.shape[0], h - y0)):
         y = j + y0
-        if y < 0 or y >= h:
-            continue
-        for i in range(depth.shape[1]):
+        down = (y - cy) / fy
+        for i in range(max(0, -x0), min(depth.shape[1], w - x0)):
             x, z = i + x0, float(depth[j, i])
-            if z <= 0.0 or x < 0 or x >= w:
+            if z <= 0.0:
                 continue
-            px, py = (x - cx) / fx * z, (y - cy) / fy * z
-            qx = T_key_camera[0, 0] * px + T_key_camera[0, 1] * py + T_key_camera[0, 2] * z + T_key_camera[0, 3]
-            qy = T_key_camera[1, 0] * px + T_key_camera[1, 1] * py + T_key_camera[1, 2] * z + T_key_camera[1, 3]
-            qz = T_key_camera[2, 0] * px + T_key_camera[2, 1] * py + T_key_camera[2, 2] * z + T_key_camera[2, 3]
+            px, py = across[i] * z, down * z
+            qz = zx * px + zy * py + zz * z + tz
             if qz < 1e-4:
                 continue
-            u = key_camera[0, 0] * qx / qz + key_camera[0, 2]
-            v = key_camera[1, 1] * qy / qz + key_camera[1, 2]
+            u = key_fx * (xx * px + xy * py + xz * z + tx) / qz + key_cx
+            v = key_fy * (yx * px + yy * py + yz * z + ty) / qz + key_cy
             a, b = int(np.floor(u)), int(np.floor(v))
             if a < 0 or b < 0 or a + 1 >= kw or b + 1 >= kh:
                 continue

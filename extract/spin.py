@@ -21,6 +21,7 @@ from .colours import ColourModel
 from .geometry import Array
 from .raster import render_depth
 from .region import TrackingMesh
+from .region_kernels import look_up
 
 SPINS = 36
 STEP_RAD = 2 * np.pi / SPINS
@@ -40,7 +41,9 @@ JUMP = 0.08  # of the mesh's radius, in depth, that makes an inner contour
 def object_evidence(bins: NDArray[np.int32], colours: ColourModel) -> NDArray[np.float32]:
     """(H, W) log-odds, by colour alone, that a pixel shows the object."""
     odds = np.log((colours.foreground[-1] + 1e-5) / (colours.background[-1] + 1e-5))
-    return np.asarray(np.clip(odds, *EVIDENCE_RANGE)[bins], np.float32)
+    evidence = np.empty(bins.shape, np.float32)
+    look_up(np.clip(odds, *EVIDENCE_RANGE), bins, evidence)
+    return evidence
 
 
 def turn_scores(
@@ -157,26 +160,22 @@ def _sum_up(
     """Into sums (6,): evidence and area of a silhouette, edge and length of its outline, and of the jumps inside it."""
     h, w = depth.shape
     with_edges = edges.shape[0] > 0
-    for y in range(1, h - 1):
-        for x in range(1, w - 1):
+    covered, area, outer, rim, inner, contour = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for y in range(max(1, -y0), min(h - 1, evidence.shape[0] - y0)):
+        for x in range(max(1, -x0), min(w - 1, evidence.shape[1] - x0)):
             d = depth[y, x]
+            if d == 0.0:
+                continue
             v, u = y + y0, x + x0
-            if d == 0.0 or v < 0 or u < 0 or v >= evidence.shape[0] or u >= evidence.shape[1]:
+            covered += evidence[v, u]
+            area += 1.0
+            if not with_edges or edges[v, u] < 0.0:
                 continue
-            sums[0] += evidence[v, u]
-            sums[1] += 1.0
-            if not with_edges:
-                continue
-            outside, behind = False, False
-            for side in range(4):
-                other = depth[y + (side == 0) - (side == 1), x + (side == 2) - (side == 3)]
-                outside |= other == 0.0
-                behind |= other > d + jump_m
-            if edges[v, u] < 0.0:
-                continue
-            if outside:
-                sums[2] += edges[v, u]
-                sums[3] += 1.0
-            elif behind:
-                sums[4] += edges[v, u]
-                sums[5] += 1.0
+            north, south, west, east = depth[y - 1, x], depth[y + 1, x], depth[y, x - 1], depth[y, x + 1]
+            if min(min(north, south), min(west, east)) == 0.0:
+                outer += edges[v, u]
+                rim += 1.0
+            elif max(max(north, south), max(west, east)) > d + jump_m:
+                inner += edges[v, u]
+                contour += 1.0
+    sums[:] = covered, area, outer, rim, inner, contour

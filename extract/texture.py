@@ -13,6 +13,7 @@ whether the matches are rigid and whether they contradict the outline; what is n
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -48,12 +49,16 @@ STRAIN = (0.05, 0.4)  # squared standard deviations a line that the points cost 
 
 @dataclass(frozen=True)
 class KeyView:
-    """A frame that others are matched to: flattened grey picture, its camera, the pose and the mesh's depth there."""
+    """A frame that others are matched to: flattened grey picture, its camera, the pose and the mesh's depth there.
+
+    side: (3,) which side of the object it shows, see `_towards`.
+    """
 
     picture: NDArray[np.uint8]
     camera_matrix: Array
     T_camera_object: Array
     depth: DepthWindow
+    side: Array
 
 
 @dataclass(frozen=True)
@@ -98,7 +103,7 @@ class Texture:
         found = [_matched(view, picture, camera_matrix, T_predicted, depth) for view in views]
         object_m = np.concatenate([points for points, _ in found])
         pixel = np.concatenate([pixels for _, pixels in found])
-        std_px = np.repeat([self._std_px(v, T_predicted, camera_matrix) for v in views], [len(f[1]) for f in found])
+        std_px = np.repeat(self._std_px(views, T_predicted, camera_matrix), [len(f[1]) for f in found])
         if len(pixel) < ENOUGH:
             return NO_MATCHES
         cv2.setRNGSeed(0)  # RANSAC draws from OpenCV's global generator
@@ -139,32 +144,33 @@ class Texture:
 
         ours: (H, W) where it shows the object, and nothing that hides it; all of the silhouette when not given.
         """
-        apart = [angle_between_rad(_towards(T_camera_object), _towards(v.T_camera_object)) for v in self.views]
-        key = key and len(self.views) < MOST_VIEWS and all(angle >= VIEWS_APART_RAD for angle in apart)
+        apart = _apart(T_camera_object, self.views)
+        key = key and len(self.views) < MOST_VIEWS and bool((apart >= VIEWS_APART_RAD).all())
         if not (key or self._off_m > 0.0):
             return
         depth = render_depth(self.mesh.vertices_m, self.mesh.faces, T_camera_object, camera_matrix)
         if depth is None:
             return
-        view = KeyView(picture, camera_matrix, T_camera_object, depth if ours is None else depth.only(ours))
+        depth = depth if ours is None else depth.only(ours)
+        view = KeyView(picture, camera_matrix, T_camera_object, depth, _towards(T_camera_object))
         if key:
             self.views.append(view)
         if self._off_m > 0.0:
             self._before = view
 
-    def _std_px(self, view: KeyView, T: Array, camera_matrix: Array) -> float:
-        """Standard deviation of where a view's points are in a frame, whose pose is about T."""
-        turn = float(angle_between_rad(_towards(T), _towards(view.T_camera_object)))
-        off_px = self._off_m * np.sin(turn) * camera_matrix[0, 0] / T[2, 3]
-        return float(np.hypot(np.hypot(POINT_STD_PX, off_px), CHAIN_STD_PX if view is self._before else 0.0))
+    def _std_px(self, views: Sequence[KeyView], T: Array, camera_matrix: Array) -> Array:
+        """(N,) standard deviation of where each view's points are in a frame, whose pose is about T."""
+        off_px = self._off_m * np.sin(_apart(T, views)) * camera_matrix[0, 0] / T[2, 3]
+        chained = [CHAIN_STD_PX if view is self._before else 0.0 for view in views]
+        return np.asarray(np.hypot(np.hypot(POINT_STD_PX, off_px), chained))
 
     def _views_for(self, T: Array) -> list[KeyView]:
-        angles = [float(angle_between_rad(_towards(T), _towards(v.T_camera_object))) for v in self.views]
-        near = [k for k, angle in enumerate(angles) if angle < VIEWS_REACH_RAD]
-        if not near:
+        """The oldest of the views that show nearly the same side as a pose does, and the nearest."""
+        angles = _apart(T, self.views)
+        near = np.flatnonzero(angles < VIEWS_REACH_RAD)
+        if len(near) == 0:
             return []
-        nearest = min(near, key=lambda k: angles[k])
-        return [self.views[k] for k in sorted({near[0], nearest})]
+        return [self.views[k] for k in sorted({int(near[0]), int(np.argmin(angles))})]
 
 
 def flattened(rgb: Image) -> NDArray[np.uint8]:
@@ -229,6 +235,11 @@ def _pose_from(points: Points, camera_matrix: Array, T_near: Array) -> Array:
         10 * RANSAC_PX + 40.0, camera_matrix, T_near, prior, 6, turn, shift, information,
     )  # fmt: skip
     return make_pose(turn, shift)
+
+
+def _apart(T: Array, views: Sequence[KeyView]) -> Array:
+    """(N,) angles in rad between the side of the object that a pose shows and those that views show."""
+    return angle_between_rad(_towards(T), np.array([view.side for view in views]).reshape(-1, 3))
 
 
 def _towards(T: Array) -> Array:

@@ -26,7 +26,7 @@ from .region import Outline, TrackingMesh, draw_outline, edge_strength, measure,
 from .segment import Mask
 from .spin import mirrored, object_evidence
 from .texture import NO_MATCHES, Matches, Texture, flattened
-from .video import Image
+from .video import Image, softened
 
 LOGISTIC = (5.26, 2.42, 2.27, -3.29)
 ON_SURFACE = 0.9  # least share of the depth readings on a right pose's mesh
@@ -366,10 +366,10 @@ class ObjectTracker:
         image = np.ascontiguousarray(rgb[y_a:y_b, x_a:x_b])
         camera = self.camera_matrix.copy()
         camera[:2, 2] -= (x_a, y_a)
-        bins = colour_bins(image)
+        bins, soft = colour_bins(image), softened(image)
         if self.background is not None:
-            self.colours.hide(bins, self.background.part(x_a, y_a, x_b, y_b).covered(image))
-        return _Part(bins, edge_strength(image), flattened(image), camera)
+            self.colours.hide(bins, self.background.part(x_a, y_a, x_b, y_b).covered(image, soft))
+        return _Part(bins, edge_strength(image, soft), flattened(image), camera)
 
     def _share_in_view(self, T: Array) -> float:
         """Share of the mesh's centres that project into the image."""

@@ -235,6 +235,11 @@ def _pick(frames: Iterator[VideoFrame], wanted_s: Sequence[float], max_side_px: 
     return picked
 
 
+def softened(rgb: Image) -> Image:
+    """The picture without the noise of single pixels."""
+    return np.asarray(cv2.GaussianBlur(rgb, (0, 0), 1.0), np.uint8)
+
+
 def _shrunk(rgb: Image, max_side_px: int | None) -> Image:
     scale = 1.0 if max_side_px is None else max_side_px / max(rgb.shape[:2])
     if scale >= 1.0:
