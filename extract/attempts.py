@@ -25,7 +25,7 @@ from .follow import Followed
 from .geometry import Array, projected_box, scaled_camera
 from .masks import read_mask
 from .progress import Progress
-from .segment import Box, check_box, mask_box
+from .segment import Box, box_iou, check_box, mask_box
 from .starting import STARTING_SIDE_PX, WORKING_SIDE_PX, NotFoundError, Start, resized, scaled, sharpened, start_object
 from .video import Image, VideoInfo, iterate_frames
 
@@ -34,6 +34,7 @@ LESS_SURE = 0.05  # of confidence, that a focal length told by the clip may cost
 SURELY_FOLLOWED = 0.65  # mean confidence over the clip, below which it is tried from another frame as well
 AWAY_FRAMES, FOLLOWED_THERE, ELSEWHERE_MARGIN = 12, 0.4, 0.15  # least distance, confidence and gain of that
 SURELY_BEGUN, WIDER, WIDER_MARGIN = 0.92, 1.1, 0.05  # below the first a box that much larger is tried; least gain
+SAME_PLACE_IOU = 0.5  # of boxes in the start frame, least
 OTHER_FRAMES = (45,)  # looked at when what was found in the first cannot be followed surely
 
 
@@ -97,7 +98,7 @@ def best_attempt(
     if best.sure < SURELY_BEGUN and requests[0].mask is None:
         report(0, count, f"looking again for {name}, in a wider box")
         other = _from_wider_box(best, requests[0], models[0], report)
-        if other is not None and other.sure > best.sure + WIDER_MARGIN:
+        if other is not None and other.sure > best.sure + WIDER_MARGIN and _begins_as(best, other):
             best = other
     return best
 
@@ -224,10 +225,20 @@ def _mended(
         words = f"looking again for {requests[0].name}, in a frame that shows it better"
         report(0, attempt.scene.info.frame_count, words)
         again = _from_elsewhere(attempt, requests, models, report, watch)
-        if again is not None and again.sure > attempt.sure + ELSEWHERE_MARGIN:
+        surer = again is not None and again.sure > attempt.sure + ELSEWHERE_MARGIN
+        # What was lost may have been taken for something else, which is then followed surely.
+        if again is not None and surer and (not requests[0].pointed_at or _begins_as(attempt, again)):
             attempt = again
     clip = _clip(attempt.scene, attempt.index, attempt.sharp)
     return replace(attempt, followed=look_again(clip, attempt.followed, attempt.watched, report))
+
+
+def _begins_as(first: Attempt, other: Attempt) -> bool:
+    """Whether the handled object of another attempt stands where the first one's was found, in that frame."""
+    known, scene = other.followed[0], first.scene
+    box = projected_box(known.camera_matrix, known.estimates[first.index].T_camera_object, known.mesh.vertices_m)
+    begun = first.starts[0].best.box
+    return box is not None and box_iou(scaled(box, scene.start_scale / scene.scale), begun) > SAME_PLACE_IOU
 
 
 def _from_elsewhere(

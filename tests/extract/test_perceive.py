@@ -116,6 +116,10 @@ def test_what_was_followed_unsurely_is_looked_for_in_a_wider_box_as_well(
     kept = follow(clip, mesh_file, tmp_path / "kept")  # of what is as sure the first
     assert np.array_equal(kept.T_camera_object, plain.T_camera_object)
     monkeypatch.setattr("vid2demo.extract.attempts.WIDER_MARGIN", -1.0)
+    with monkeypatch.context() as strict:
+        strict.setattr("vid2demo.extract.attempts.SAME_PLACE_IOU", 1.0)  # nor is anything the same object
+        other = follow(clip, mesh_file, tmp_path / "other")
+        assert np.array_equal(other.T_camera_object, plain.T_camera_object)
     track = follow(clip, mesh_file, tmp_path / "wider")
     assert track.header["settings"]["box_source"] == "widened"
     assert track.header["settings"]["start_frame"] == 0
