@@ -178,6 +178,14 @@ class Followed:
         return float(np.mean([e.confidence * e.visible for e in self.estimates]))
 
     @property
+    def flow_share(self) -> float:
+        """Share in [0, 1] of the points of a printed surface that move as the poses say; 0 where nothing is printed."""
+        if self.vessel is None or len(self.glimpses) < 2:
+            return 0.0
+        poses = np.stack([e.T_camera_object for e in self.estimates])
+        return float(np.mean(self._flow_spins(poses, self.glimpses, self.vessel.interior.axis_xy_m)[1][1:]))
+
+    @property
     def spin_source(self) -> str:
         """What told the object's turns about its own axis: "texture", "outline" or "none"."""
         return self.tracker.spin_source(len(self.estimates))
@@ -202,22 +210,31 @@ class Followed:
         self, poses: Array, glimpses: list[Glimpse], axis_xy_m: tuple[float, float]
     ) -> tuple[Array, NDArray[np.bool_]]:
         """The poses spun from glimpse to glimpse as the flow between them says; and whether it says so, by glimpse."""
-        spins, told = np.zeros(len(glimpses)), np.zeros(len(glimpses), bool)
-        for m, (before, after) in enumerate(pairwise(glimpses), start=1):
-            apart = after.index - before.index
-            for flow, one, other in ((after.flow, before, after), (before.flow, after, before)):
-                if flow is None or flow.frames != other.index - one.index:
-                    continue
-                spin = spin_by_flow(
-                    self.mesh, poses[one.index], poses[other.index], self.camera_matrix, flow, axis_xy_m
-                )
-                if spin is not None:
-                    spins[m], told[m] = np.sign(apart * flow.frames) * spin, True
+        spins, shares = self._flow_spins(poses, glimpses, axis_xy_m)
+        told = shares > 0
         if not told.any():
             return poses, told
         at = np.array([g.index for g in glimpses])
         turns = Rotation.from_rotvec(np.outer(np.cumsum(spins), [0.0, 0.0, 1.0])).as_matrix()
         return turned(poses, at, turns, axis_xy_m), told
+
+    def _flow_spins(self, poses: Array, glimpses: list[Glimpse], axis_xy_m: tuple[float, float]) -> tuple[Array, Array]:
+        """(M,) rad that the flow from each glimpse's predecessor to it says more than the poses, and (M,) how surely.
+
+        See `spin_by_flow`; nothing where there is no flow, and for the first.
+        """
+        spins, shares = np.zeros(len(glimpses)), np.zeros(len(glimpses))
+        for m, (before, after) in enumerate(pairwise(glimpses), start=1):
+            apart = after.index - before.index
+            for flow, one, other in ((after.flow, before, after), (before.flow, after, before)):
+                if flow is None or flow.frames != other.index - one.index:
+                    continue
+                spin, share = spin_by_flow(
+                    self.mesh, poses[one.index], poses[other.index], self.camera_matrix, flow, axis_xy_m
+                )
+                if share > shares[m]:
+                    spins[m], shares[m] = np.sign(apart * flow.frames) * spin, share
+        return spins, shares
 
     def _fitted(self, poses: Array, vessel: Vessel) -> tuple[Vessel, Array]:
         """The vessel fitted to several frames, and its poses in all; unchanged if that is no better."""

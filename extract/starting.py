@@ -62,7 +62,8 @@ class Start:
     """An object in the start frame, at the starting resolution: its explanations, best first.
 
     box_source: "given", "mask", "found", "followed" or "widened".  box: where it was looked for.  labels: of the
-    background, if it is known.  frame: index of the start frame in the clip.
+    background, if it is known.  frame: index of the start frame in the clip.  other_places: boxes where it might be as
+    well, the likeliest first.
     """
 
     hypotheses: tuple[Hypothesis, ...]
@@ -70,6 +71,7 @@ class Start:
     box: Box
     labels: NDArray[np.uint8] | None = None
     frame: int = 0
+    other_places: tuple[Box, ...] = ()
 
     @property
     def best(self) -> Hypothesis:
@@ -134,14 +136,15 @@ def start_object(
             refusal = error
     if not found:
         raise refusal
-    box, fits = max(found, key=lambda entry: entry[1][0].pose.merit)
+    found.sort(key=lambda entry: entry[1][0].pose.merit, reverse=True)
+    box, fits = found[0]
     kept = distinct([fit.pose for fit in fits], APART_DEG, HYPOTHESES, RIVAL_WITHIN, fits[0].model.symmetry)
     explained = [
         _hypothesis(fit, resized(fit.evidence(small, camera), rgb) if mask is None else mask, rgb, camera_matrix)
         for fit in fits
         if any(fit.pose is k for k in kept)
     ]
-    return Start(tuple(explained), source, box, labels)
+    return Start(tuple(explained), source, box, labels, other_places=tuple(place for place, _ in found[1:]))
 
 
 @dataclass(frozen=True)

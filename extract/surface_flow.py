@@ -79,15 +79,15 @@ class CarriedPoints:
 def spin_by_flow(
     mesh: TrackingMesh, T_before: Array, T_after: Array, camera_matrix: Array, flow: SurfaceFlow,
     axis_xy_m: tuple[float, float] = (0.0, 0.0),
-) -> float | None:  # fmt: skip
+) -> tuple[float, float]:  # fmt: skip
     """By how much in rad the vessel is spun more than its poses say from the flow's one frame to its other.
 
-    None where the points do not agree about any.
+    And the share of the points in [0, 1] that agree about that; 0 where too few do (LEAST_SHARE).
     """
     points_m, seen = _lifted(mesh, T_before, camera_matrix, flow.before_px)
     after_px = flow.after_px[seen]
     if len(points_m) < LEAST_POINTS:
-        return None
+        return 0.0, 0.0
     axis_m = np.array([*axis_xy_m, 0.0])
     spun_m = np.einsum("kij,nj->kni", TURNS, points_m - axis_m) + axis_m
     seen_m = spun_m @ T_after[:3, :3].T + T_after[:3, 3]
@@ -96,8 +96,8 @@ def spin_by_flow(
     agree = np.maximum(0.0, 1.0 - (error_px / AGREE_PX) ** 2).sum(axis=1)
     best = int(np.argmax(agree))
     if agree[best] < max(LEAST_POINTS, LEAST_SHARE * len(points_m)):
-        return None
-    return float(TRIED_RAD[best])
+        return 0.0, 0.0
+    return float(TRIED_RAD[best]), float(agree[best] / len(points_m))
 
 
 def _lifted(mesh: TrackingMesh, T: Array, camera_matrix: Array, pixels: Array) -> tuple[Array, NDArray[np.bool_]]:

@@ -206,7 +206,9 @@ def test_a_printed_can_tells_by_how_much_it_spun_more_than_its_poses_say(can: Tr
     assert flow.frames == 5
     for missed_deg in (-9.0, 0.0, 14.0):
         said = spun(true[-1], np.deg2rad(-missed_deg))
-        assert spin_by_flow(can, true[0], said, K, flow) == pytest.approx(np.deg2rad(missed_deg), abs=np.deg2rad(1.5))
+        spin, share = spin_by_flow(can, true[0], said, K, flow)
+        assert spin == pytest.approx(np.deg2rad(missed_deg), abs=np.deg2rad(1.5))
+        assert 0.7 < share <= 1.0
 
 
 def test_a_flow_backward_in_time_tells_the_opposite(can: TrackingMesh) -> None:
@@ -214,8 +216,8 @@ def test_a_flow_backward_in_time_tells_the_opposite(can: TrackingMesh) -> None:
     there, back = flow_through(can, true, label()), flow_through(can, true[::-1], label())
     assert there is not None
     assert back is not None
-    forward = spin_by_flow(can, true[0], true[0], K, there)
-    backward = spin_by_flow(can, true[-1], true[-1], K, back)
+    forward, _ = spin_by_flow(can, true[0], true[0], K, there)
+    backward, _ = spin_by_flow(can, true[-1], true[-1], K, back)
     assert forward == pytest.approx(np.deg2rad(12.0), abs=np.deg2rad(1.5))
     assert backward == pytest.approx(-np.deg2rad(12.0), abs=np.deg2rad(1.5))
 
@@ -225,7 +227,7 @@ def test_a_mesh_that_is_only_like_the_can_tells_it_as_well(can: TrackingMesh) ->
     flow = flow_through(can, true, label())
     slim = TrackingMesh.build(can.vertices_m * [0.92, 0.92, 1.05], can.faces)
     assert flow is not None
-    assert spin_by_flow(slim, true[0], true[0], K, flow) == pytest.approx(np.deg2rad(12.0), abs=np.deg2rad(2.5))
+    assert spin_by_flow(slim, true[0], true[0], K, flow)[0] == pytest.approx(np.deg2rad(12.0), abs=np.deg2rad(2.5))
 
 
 def test_a_plain_can_tells_nothing(can: TrackingMesh) -> None:
@@ -236,4 +238,12 @@ def test_points_that_move_at_random_tell_nothing(can: TrackingMesh) -> None:
     flow = flow_through(can, [pose(0.0)] * 3, label())
     assert flow is not None
     astray = flow.after_px + np.random.default_rng(0).normal(0, 12, flow.after_px.shape)
-    assert spin_by_flow(can, pose(0.0), pose(0.0), K, SurfaceFlow(2, flow.before_px, astray)) is None
+    assert spin_by_flow(can, pose(0.0), pose(0.0), K, SurfaceFlow(2, flow.before_px, astray)) == (0.0, 0.0)
+
+
+def test_poses_that_lean_otherwise_than_the_can_are_believed_less(can: TrackingMesh) -> None:
+    true = [pose(0.0, lean_deg=9.0 * k) for k in range(4)]
+    flow = flow_through(can, true, label())
+    assert flow is not None
+    upright = pose(0.0)
+    assert spin_by_flow(can, true[0], true[-1], K, flow)[1] > spin_by_flow(can, upright, upright, K, flow)[1] + 0.2
