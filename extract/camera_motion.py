@@ -36,6 +36,7 @@ OBJECT_MARGIN = 0.15  # of the box, left out around it: hands and shadows move w
 NEW_VIEW_SHARE = 0.02  # of the longer side, that corners have moved since the last frame of which everything is kept
 STANDS_SHARE = 0.9  # of the corners, far and near, that have not moved: then the camera has not
 KEPT_BETWEEN = 60  # corners of a frame between those
+CALM_SHARE = 0.5  # of the corners that have not moved, in frames in which the camera stands surely
 CALM_FRAMES, LOOK_EVERY = 12, 6  # a camera that stood so long is looked at in every sixth frame, until it moves
 TURN_SHARE = 0.85  # of the corners that fit a homography: when so many fit a rotation too, it is a rotation
 
@@ -172,7 +173,8 @@ class CameraWatch:
         self._H.append(H)
         self._R.append(R)
         self._quality.append((quality, turn_quality))
-        stands = key is self._key and key is not None and H is key.H_key_first and self.sightings[-1] is seen
+        same = key is self._key and self._view is seen
+        stands = same and key is not None and H is key.H_key_first and _still_share(key) > CALM_SHARE
         self._calm = self._calm + 1 if stands else 0
 
     def result(self) -> CameraMotion:
@@ -231,7 +233,7 @@ class CameraWatch:
         key.now = (now - (settled - key.start))[good]
         key.ids, key.start = key.ids[good], key.start[good]
         offset = np.linalg.norm(key.now - key.start, axis=1)
-        still = float(np.mean(offset < STILL_PX))
+        still = _still_share(key)
         if still > STILL_SHARE and still * len(offset) >= FEWEST_CORNERS // 2:
             share = float(np.mean(offset < INLIER_PX))
             return key.H_key_first, key.R_key_first, share, share
@@ -300,6 +302,11 @@ def _flow(
         a, b, points.reshape(-1, 1, 2), begin, winSize=(15, 15), maxLevel=3, flags=flags
     )
     return np.asarray(moved[:, 0], np.float32), np.asarray(status[:, 0] > 0)
+
+
+def _still_share(key: _KeyFrame) -> float:
+    """Of the corners that are left, those that are where they were in the key frame."""
+    return float(np.mean(np.linalg.norm(key.now - key.start, axis=1) < STILL_PX))
 
 
 def _moved(H: Array, pixels: Array) -> Array:
