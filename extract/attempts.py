@@ -103,13 +103,12 @@ def best_attempt(
     first = max(attempts, key=lambda attempt: attempt.sure)
     best = _mended(first, requests, models, report, watch_camera)
     if requests[0].mask is None:
-        for box, source in [*((place, "found") for place in first.starts[0].other_places[:1]), (None, "widened")]:
-            if best.sure >= SURELY_BEGUN:
-                break
-            report(0, count, f"looking again for {name}, in another box")
-            other = _from_box(best if box is None else first, requests[0], models[0], box, source, report)
-            if other is not None and other.worth > best.worth + OTHER_BOX_MARGIN:
-                best = other
+        if best.sure < SURELY_BEGUN and (places := first.starts[0].other_places):
+            report(0, count, f"looking again for {name}, in another place")
+            best = _better(best, _from_box(first, requests[0], models[0], places[0], "found", report))
+        if best.sure < SURELY_BEGUN:
+            report(0, count, f"looking again for {name}, in a wider box")
+            best = _better(best, _from_box(best, requests[0], models[0], _wider_box(best), "widened", report))
     return best
 
 
@@ -279,18 +278,15 @@ def _from_elsewhere(
 
 
 def _from_box(
-    first: Attempt, request: ObjectRequest, candidates: list[Model], box: Box | None, source: str, report: Progress
+    first: Attempt, request: ObjectRequest, candidates: list[Model], box: Box, source: str, report: Progress
 ) -> Attempt | None:
-    """The handled object looked for once more in the same frame: in another box, or one somewhat larger if it is None.
+    """The handled object looked for once more in the same frame, in another box.
 
     What is cut out of another box is cut a little otherwise, and so is what is fitted to it: where two explanations of
     the start frame are nearly as good, the whole clip tells which is better.
     """
-    scene, (height, width) = first.scene, first.sharp.shape[:2]
-    if box is None:
-        x, y, w, h = first.starts[0].box
-        box = check_box((x - (WIDER - 1) / 2 * w, y - (WIDER - 1) / 2 * h, WIDER * w, WIDER * h), width, height)
-    labels, camera = first.starts[0].labels, scene.camera(scene.start_scale)
+    scene, labels = first.scene, first.starts[0].labels
+    camera = scene.camera(scene.start_scale)
     try:
         start = start_object(request, candidates, first.sharp, [box], source, camera, None, labels)
     except NotFoundError:
@@ -301,6 +297,16 @@ def _from_box(
         return None
     starts, followed = [other.starts[0], *first.starts[1:]], [other.followed[0], *first.followed[1:]]
     return replace(other, starts=starts, followed=followed, watched=first.watched)
+
+
+def _wider_box(attempt: Attempt) -> Box:
+    """Somewhat larger than the one that the handled object was found in, as far as the picture reaches."""
+    (height, width), (x, y, w, h) = attempt.sharp.shape[:2], attempt.starts[0].box
+    return check_box((x - (WIDER - 1) / 2 * w, y - (WIDER - 1) / 2 * h, WIDER * w, WIDER * h), width, height)
+
+
+def _better(best: Attempt, other: Attempt | None) -> Attempt:
+    return best if other is None or other.worth <= best.worth + OTHER_BOX_MARGIN else other
 
 
 def _clip(scene: Scene, index: int, sharp: Image) -> Clip:

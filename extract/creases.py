@@ -13,7 +13,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from .geometry import Array, invert_pose, project, transform_points
+from .geometry import Array, invert_pose, project, transform_points, unproject
 from .raster import DepthWindow
 
 JUMP = 0.08  # of the mesh's radius, in depth, that makes an inner contour
@@ -68,8 +68,7 @@ def draw_creases(window: DepthWindow, radius_m: float, T_camera_object: Array, c
         return None
     z = window.depth_m[at[:, 1], at[:, 0]].astype(float)
     pixel = at + np.array([window.x0_px, window.y0_px]) + 0.5 * normal
-    rays = np.column_stack([(pixel - camera_matrix[:2, 2]) / np.diag(camera_matrix)[:2], np.ones(len(z))])
-    points = transform_points(invert_pose(T_camera_object), rays * z[:, None])
+    points = transform_points(invert_pose(T_camera_object), unproject(camera_matrix, pixel, z))
     return Creases(points, normal @ T_camera_object[:2, :3], jump)
 
 

@@ -108,22 +108,24 @@ class Followed:
         now = self.tracker.step(rgb, guess, depth)
         self.estimates.append(now if before is None or now.confidence > before.confidence else before)
         if self.guesses is None and self.vessel is not None:
-            self._look(rgb, index, frame_count, depth, self.vessel.symmetry.order != 0)
+            self._look(rgb, index, frame_count, depth)
 
-    def _look(self, rgb: Image, index: int, frame_count: int, depth: DepthView | None, spins: bool) -> None:
+    def _look(self, rgb: Image, index: int, frame_count: int, depth: DepthView | None) -> None:
         """Carry points of the surface on, and keep a glimpse of every so many frames."""
-        grey = np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), np.uint8)
         if self.carried is not None:
-            self.carried.step(grey)
+            self.carried.step(_grey(rgb))
         if index % max(1, frame_count // GLIMPSES) == 0:
             glimpse = self._glimpse(rgb, index, depth, whole=len(self.glimpses) % WHOLE_EVERY == 0)
             self.glimpses.append(replace(glimpse, flow=None if self.carried is None else self.carried.flow()))
-            seen = render_depth(
-                self.mesh.vertices_m, self.mesh.faces, self.estimates[-1].T_camera_object, self.camera_matrix
-            )
-            self.carried = None
-            if spins and self.estimates[-1].visible and seen is not None:
-                self.carried = CarriedPoints(grey, seen.mask_in_image(rgb.shape[1], rgb.shape[0]))
+            self.carried = self._points_to_carry(rgb)
+
+    def _points_to_carry(self, rgb: Image) -> CarriedPoints | None:
+        """Those of the frame that was just followed, of a vessel whose spin can be asked for."""
+        now = self.estimates[-1]
+        if self.vessel is None or self.vessel.symmetry.order == 0 or not now.visible:
+            return None
+        seen = render_depth(self.mesh.vertices_m, self.mesh.faces, now.T_camera_object, self.camera_matrix)
+        return None if seen is None else CarriedPoints(_grey(rgb), seen.mask_in_image(rgb.shape[1], rgb.shape[0]))
 
     def _glimpse(self, rgb: Image, index: int, depth: DepthView | None, whole: bool) -> Glimpse:
         bins, soft, colours = colour_bins(rgb), softened(rgb), self.tracker.colours
@@ -285,6 +287,10 @@ class Followed:
                 most = float(np.maximum(glimpse.evidence, 0)[silhouette].sum())
                 total += float(glimpse.evidence[silhouette].sum()) / max(most, 1.0)
         return total / len(glimpses)
+
+
+def _grey(rgb: Image) -> NDArray[np.uint8]:
+    return np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), np.uint8)
 
 
 def _between_sure(poses: Array, sure: NDArray[np.bool_]) -> Array:

@@ -105,6 +105,12 @@ def project(camera_matrix: Array, points_camera_m: Array) -> Array:
     return uvw[..., :2] / uvw[..., 2:]
 
 
+def unproject(camera_matrix: Array, pixels: Array, depth_m: Array) -> Array:
+    """Points (N, 3) in the camera frame that are seen in pixels (N, 2) at depths (N,) along the camera's z."""
+    rays = np.column_stack([(pixels - camera_matrix[:2, 2]) / np.diag(camera_matrix)[:2], np.ones(len(depth_m))])
+    return np.asarray(rays * depth_m[:, None])
+
+
 def extent(points: Array) -> tuple[Array, Array]:
     """Lowest and highest corner (D,) of the box around points (N, D)."""
     # Column by column, which NumPy is ten times faster at than along the first axis of a narrow array.

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from .colours import HIDDEN_BIN, LOCAL_CENTRES, ColourModel
 from .creases import Creases, draw_creases
-from .geometry import Array, invert_pose, make_pose, project, shows_same_side, transform_points
+from .geometry import Array, invert_pose, make_pose, project, shows_same_side, transform_points, unproject
 from .raster import render_depth
 from .region_kernels import free_lengths, learn_lines, measure_lines, solve_pose, strongest_gradient
 from .video import Image, softened
@@ -175,8 +175,7 @@ def draw_outline(
     z = window.depth_m[cy, cx].astype(float)
     # The outline runs half a pixel outside the last pixel of the silhouette.
     pixel = np.stack([cx + window.x0_px, cy + window.y0_px], axis=1) + 0.5 * normal
-    rays = np.column_stack([(pixel - camera_matrix[:2, 2]) / np.diag(camera_matrix)[:2], np.ones(len(z))])
-    points = transform_points(invert_pose(T_camera_object), rays * z[:, None])
+    points = transform_points(invert_pose(T_camera_object), unproject(camera_matrix, pixel, z))
     inside, outside = np.zeros(len(z), np.float32), np.zeros(len(z), np.float32)
     free_lengths(contour.astype(np.float64), normal, mask, inside, outside)
     nearest = mesh.tree.query(points, k=3)[1].astype(np.int32)

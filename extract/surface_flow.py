@@ -14,15 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from .geometry import Array
+from .geometry import Array, unproject
 from .point_tracks import moved_points
 from .raster import DepthWindow, render_depth
 from .region import TrackingMesh
 
 CORNERS, APART_PX, PATCH_PX = 80, 5, 5
-LEAST_CORNER = (
-    2e-3  # smaller eigenvalue: shadows, rims and reflections, which do not turn with a vessel, have weaker ones
-)
+LEAST_CORNER = 2e-3  # smaller eigenvalue; shadows, rims and reflections do not turn with a vessel and have weaker ones
 INNER_PX = 3  # from the silhouette's outline, least
 FLOW_PX = 48  # most that a point moves between frames
 LEAST_POINTS, LEAST_SHARE = 8, 0.5  # that agree about a spin
@@ -110,5 +108,4 @@ def _lifted(mesh: TrackingMesh, T: Array, camera_matrix: Array, pixels: Array) -
     inside = (x >= 0) & (y >= 0) & (x < width) & (y < height)
     z = np.where(inside, window.depth_m[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)], 0.0).astype(float)
     seen = z > 0
-    rays = np.column_stack([(pixels - camera_matrix[:2, 2]) / np.diag(camera_matrix)[:2], np.ones(len(z))])
-    return (rays[seen] * z[seen, None] - T[:3, 3]) @ T[:3, :3], seen
+    return (unproject(camera_matrix, pixels[seen], z[seen]) - T[:3, 3]) @ T[:3, :3], seen

@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .geometry import Array, angle_between_rad, invert_pose, make_pose
+from .geometry import Array, angle_between_rad, invert_pose, make_pose, unproject
 from .raster import DepthWindow, render_depth
 from .region import Points, TrackingMesh
 from .region_kernels import draw_view, solve_pose
@@ -208,8 +208,7 @@ def _matched(
     good = near & (ok[:, 0] > 0) & (ok_back[:, 0] > 0) & (unlike[:, 0] < ALIKE * contrast)
     corners, there, x, y = corners[good, 0].astype(float), there[good, 0].astype(float), x[good], y[good]
     z = depth.depth_m[y - depth.y0_px, x - depth.x0_px].astype(float)
-    rays = np.column_stack([(corners - camera_matrix[:2, 2]) / np.diag(camera_matrix)[:2], np.ones(len(z))])
-    return (rays * z[:, None] - T[:3, 3]) @ T[:3, :3], there
+    return (unproject(camera_matrix, corners, z) - T[:3, 3]) @ T[:3, :3], there
 
 
 def _flow(

@@ -20,6 +20,7 @@ from vid2demo.extract.geometry import (
     scaled_camera,
     super_fibonacci_rotations,
     transform_points,
+    unproject,
 )
 
 angles = st.floats(-np.pi, np.pi)
@@ -108,3 +109,9 @@ def test_the_extent_of_points_is_the_box_around_them() -> None:
     low, high = extent(points)
     assert np.array_equal(low, points.min(axis=0))
     assert np.array_equal(high, points.max(axis=0))
+
+
+def test_a_pixel_at_a_depth_is_the_point_that_projects_there() -> None:
+    camera = np.array([[500.0, 0.0, 310.0], [0.0, 520.0, 250.0], [0.0, 0.0, 1.0]])
+    points = np.random.default_rng(0).uniform([-0.3, -0.2, 0.4], [0.3, 0.2, 2.0], (20, 3))
+    np.testing.assert_allclose(unproject(camera, project(camera, points), points[:, 2]), points, atol=1e-12)
