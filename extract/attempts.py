@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import cv2
@@ -26,14 +27,26 @@ from .geometry import Array, projected_box, scaled_camera
 from .masks import read_mask
 from .progress import Progress
 from .segment import Box, box_iou, check_box, mask_box
-from .starting import STARTING_SIDE_PX, WORKING_SIDE_PX, NotFoundError, Start, resized, scaled, sharpened, start_object
+from .starting import (
+    APART_DEG,
+    STARTING_SIDE_PX,
+    WORKING_SIDE_PX,
+    NotFoundError,
+    Start,
+    resized,
+    scaled,
+    sharpened,
+    start_object,
+)
 from .video import Image, VideoInfo, iterate_frames
 
 TRUSTED_CONFIDENCE = 0.6  # mean over the clip, of an object that nobody pointed at
 LESS_SURE = 0.05  # of confidence, that a focal length told by the clip may cost: noise, if it is right
 SURELY_FOLLOWED = 0.65  # mean confidence over the clip, below which it is tried from another frame as well
 AWAY_FRAMES, FOLLOWED_THERE, ELSEWHERE_MARGIN = 12, 0.4, 0.15  # least distance, confidence and gain of that
-SURELY_BEGUN, OTHER_BOX_MARGIN = 0.92, 0.05  # mean confidence below which another box is tried, and its least gain
+SURELY_BEGUN, OTHER_MARGIN = 0.92, 0.05  # mean confidence below which other attempts are made, and their least gain
+SPILLED = 0.03  # share of its colours beyond it, above which the object may be more than what is followed,
+TOLD_BY_PRINT = 0.3  # unless such a share of what is printed on it moves as the poses say
 WIDER = 1.1  # times as large as the box it was found in
 SAME_PLACE_IOU = 0.5  # of boxes in the start frame, least
 OTHER_FRAMES = (45,)  # looked at when what was found in the first cannot be followed surely
@@ -74,10 +87,20 @@ class Attempt:
         """Mean confidence of the handled object."""
         return float(np.mean([e.confidence for e in self.followed[0].estimates]))
 
-    @property
+    @cached_property
+    def spilled(self) -> float:
+        """How much of the handled object's colours goes on beyond its silhouette, as a share of that."""
+        return self.followed[0].spilled
+
+    @cached_property
+    def in_part(self) -> bool:
+        """Whether only part of the object seems to be explained, and nothing printed on it says that it is right."""
+        return self.spilled > SPILLED and self.followed[0].flow_share < TOLD_BY_PRINT
+
+    @cached_property
     def worth(self) -> float:
         """What attempts are chosen by: outlines fit wrong leans as well, what is printed on a vessel does not."""
-        return self.sure + self.followed[0].flow_share
+        return self.sure + self.followed[0].flow_share - self.spilled
 
 
 def best_attempt(
@@ -109,6 +132,9 @@ def best_attempt(
         if best.sure < SURELY_BEGUN:
             report(0, count, f"looking again for {name}, in a wider box")
             best = _better(best, _from_box(best, requests[0], models[0], _wider_box(best), "widened", report))
+        if best.in_part:
+            report(0, count, f"looking again for {name}, turned otherwise")
+            best = _better(best, _turned_otherwise(best, requests[0], models[0], report))
     return best
 
 
@@ -293,8 +319,33 @@ def _from_box(
         return None
     begun = _attempt(scene, first.index, first.sharp, [start], report, False)
     other = _mended(begun, [request], [candidates], report, False)
-    if not _begins_as(begun, other):
+    return _beside(first, other) if _begins_as(begun, other) else None
+
+
+def _turned_otherwise(
+    first: Attempt, request: ObjectRequest, candidates: list[Model], report: Progress
+) -> Attempt | None:
+    """The best of what the handled object may be in the same box if it stands otherwise: what is held may be tipped."""
+    scene, known = first.scene, first.starts[0]
+    camera = scene.camera(scene.start_scale)
+    try:
+        start = start_object(
+            request, candidates, first.sharp, [known.box], known.box_source, camera, None, known.labels, standing=False
+        )
+    except NotFoundError:
         return None
+    R, symmetry = known.best.pose.T_camera_object[:3, :3], known.best.model.symmetry
+    attempts = []
+    for turned in start.hypotheses:
+        if np.rad2deg(symmetry.error_rad(R, turned.pose.T_camera_object[:3, :3])) > APART_DEG:
+            only = replace(start, hypotheses=(turned,))
+            attempts.append(_attempt(scene, first.index, first.sharp, [only], report, False))
+    attempts = [_beside(first, attempt) for attempt in attempts if _begins_as(attempt, attempt)]
+    return max(attempts, key=lambda attempt: attempt.worth, default=None)
+
+
+def _beside(first: Attempt, other: Attempt) -> Attempt:
+    """Another attempt at the handled object, with the other objects of the first."""
     starts, followed = [other.starts[0], *first.starts[1:]], [other.followed[0], *first.followed[1:]]
     return replace(other, starts=starts, followed=followed, watched=first.watched)
 
@@ -306,7 +357,7 @@ def _wider_box(attempt: Attempt) -> Box:
 
 
 def _better(best: Attempt, other: Attempt | None) -> Attempt:
-    return best if other is None or other.worth <= best.worth + OTHER_BOX_MARGIN else other
+    return best if other is None or other.worth <= best.worth + OTHER_MARGIN else other
 
 
 def _clip(scene: Scene, index: int, sharp: Image) -> Clip:

@@ -86,14 +86,20 @@ def candidate_models(request: ObjectRequest) -> list[Model]:
 
 
 def _statures(category: str) -> list[Model]:
-    """The nominal vessel of a category, a low and a tall one: one that leans looks like another that does not."""
-    nominal = make_vessel(category)
-    height = parameter_space(category).get("height_m")
+    """The nominal vessel of a category, a low and a tall one: one that leans looks like another that does not.
+
+    Of a body of revolution the stoutest as well: nothing but its proportions tells how far it leans.
+    """
+    nominal, space = make_vessel(category), parameter_space(category)
+    height, radius = space.get("height_m"), space.get("radius_m")
     if height is None:
         return [vessel_model(nominal)]
     usual = nominal.params["height_m"]
     heights = (usual, usual + STATURE * (height.low - usual), usual + STATURE * (height.high - usual))
-    return [vessel_model(make_vessel(category, None, **{**nominal.params, "height_m": h})) for h in heights]
+    sizes = [{"height_m": h} for h in heights]
+    if nominal.symmetry.order == 0 and radius is not None:
+        sizes.append({"height_m": height.low, "radius_m": radius.high})
+    return [vessel_model(make_vessel(category, None, **{**nominal.params, **size})) for size in sizes]
 
 
 def vessel_model(vessel: Vessel) -> Model:

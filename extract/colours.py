@@ -20,6 +20,7 @@ LEAST_ODDS = 0.4  # of the object's colours against those of a hand, of what is 
 HIDING_RATE = 0.1
 LOCAL_CENTRES = 48
 MASK_LEVELS = 11  # of trust in a mask
+OURS_ODDS, SPILL_REACH = 0.7, 0.5  # log-odds of the object's colours; how far from a silhouette, of its root area
 
 
 class ColourModel:
@@ -79,6 +80,21 @@ class ColourModel:
         if fresh.any():
             smooth_histogram(fresh, 1 << BITS)
             self.hiding += HIDING_RATE * (fresh - self.hiding)
+
+
+def spilled_share(silhouette: NDArray[np.bool_], evidence: NDArray[np.float32], hidden: NDArray[np.bool_]) -> float:
+    """How much of the object's colours goes on beyond a silhouette without a gap, as a share of the silhouette.
+
+    All are (H, W).  evidence: log-odds that a pixel shows the object.  hidden: where something stands before it.
+    """
+    ours = (evidence > OURS_ODDS) & ~hidden
+    reach_px = round(SPILL_REACH * float(np.sqrt(silhouette.sum())))
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach_px + 1, 2 * reach_px + 1))
+    ours &= cv2.dilate(silhouette.astype(np.uint8), disc) > 0
+    _, part = cv2.connectedComponents((ours | silhouette).astype(np.uint8))
+    beyond = ours & np.isin(part, np.unique(part[silhouette]))
+    beyond &= cv2.dilate(silhouette.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0  # colours mix along the rim
+    return float(beyond.sum() / max(silhouette.sum(), 1))
 
 
 def mask_evidence(

@@ -92,6 +92,7 @@ def find_first_pose(
     *,
     box_xywh_px: Box | None = None,
     trust: NDArray[np.float32] | None = None,
+    standing: bool = True,
 ) -> list[PoseCandidate]:
     """Poses that explain a mask, best first.
 
@@ -100,12 +101,14 @@ def find_first_pose(
 
     box_xywh_px: box around the whole object; the mask's own when not given.
     trust: (H, W) in [0, 1] how far the mask is to be believed there; everywhere when not given.
+    standing: whether an upright pose of a vessel is likelier than others.
     """
     box = box_xywh_px or mask_box(mask)
     trust = np.ones(mask.shape, np.float32) if trust is None else trust
-    found = _searched(model, mask, camera_matrix, box, trust)
+    stands = standing and model.vessel is not None
+    found = _searched(model, mask, camera_matrix, box, trust, stands)
     bins, colours = mask_evidence(mask, trust)
-    edges, stands = edge_strength(rgb), model.vessel is not None
+    edges = edge_strength(rgb)
     for count, steps_px in ROUNDS:
         first = count // 5
         chosen = found[:first] + distinct(found[first:], OTHER_DEG, count - first, np.inf, model.symmetry)
@@ -228,7 +231,7 @@ def _share_on_edges(pixel: Array, normal: Array, strength: NDArray[np.float32]) 
 
 
 def _searched(
-    model: Model, mask: Mask, camera_matrix: Array, box: Box, trust: NDArray[np.float32]
+    model: Model, mask: Mask, camera_matrix: Array, box: Box, trust: NDArray[np.float32], stands: bool
 ) -> list[PoseCandidate]:
     """The model in many rotations where it fills the box, by how well it agrees with the mask there, best first."""
     scale, pad_px = SEARCH_SIDE_PX / max(box[2], box[3]), SEARCH_PAD * SEARCH_SIDE_PX
@@ -240,7 +243,6 @@ def _searched(
     ious = silhouettes_agree(
         vertices_m, faces, rotations, origins_m, small_camera, soft_mask > 0.5, small_trust, small_box
     )
-    stands = model.vessel is not None
     found = [
         PoseCandidate(make_pose(R, t), iou, box_iou, stands=stands)
         for R, t, (iou, box_iou) in zip(rotations, origins_m, ious.tolist(), strict=True)

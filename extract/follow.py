@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from .background import Background
-from .colours import ColourModel, colour_bins
+from .colours import ColourModel, colour_bins, spilled_share
 from .depth_size import scaled_vessel, size_of_clip
 from .depth_video import DepthView
 from .first_pose import edge_score
@@ -38,6 +38,7 @@ FIT_VIEWS = 6  # frames that the shape is fitted to
 FIT_STEPS_PX = (3.0, 1.5, 1.0, 1.0, 1.0, 1.0)
 WHOLE_EVERY = max(1, GLIMPSES // (2 * FIT_VIEWS))
 SECOND_LOOK_RAD = np.deg2rad(60)  # most that a second look at the spin may change: it mends, it does not turn round
+MOVED_PX = 5.0  # of the points of a surface from glimpse to glimpse, that tell something
 SURE = 0.5  # least confidence of a frame that the shape may be fitted to
 
 
@@ -120,9 +121,9 @@ class Followed:
             self.carried = self._points_to_carry(rgb)
 
     def _points_to_carry(self, rgb: Image) -> CarriedPoints | None:
-        """Those of the frame that was just followed, of a vessel whose spin can be asked for."""
+        """Those of the frame that was just followed, of a vessel."""
         now = self.estimates[-1]
-        if self.vessel is None or self.vessel.symmetry.order == 0 or not now.visible:
+        if self.vessel is None or not now.visible:
             return None
         seen = render_depth(self.mesh.vertices_m, self.mesh.faces, now.T_camera_object, self.camera_matrix)
         return None if seen is None else CarriedPoints(_grey(rgb), seen.mask_in_image(rgb.shape[1], rgb.shape[0]))
@@ -185,7 +186,27 @@ class Followed:
         if self.vessel is None or len(self.glimpses) < 2:
             return 0.0
         poses = np.stack([e.T_camera_object for e in self.estimates])
-        return float(np.mean(self._flow_spins(poses, self.glimpses, self.vessel.interior.axis_xy_m)[1][1:]))
+        shares = self._flow_spins(poses, self.glimpses, self.vessel.interior.axis_xy_m)[1]
+        # What stands still agrees with any pose.
+        told = [m for m in range(1, len(shares)) if (flow := self.glimpses[m].flow) is None or flow.moved_px > MOVED_PX]
+        return float(np.mean(shares[told])) if told else 0.0
+
+    @property
+    def spilled(self) -> float:
+        """How much of the object's colours goes on beyond the mesh, as a share of its silhouette.
+
+        A mesh that is only part of the object may be followed as surely as the right one, but not without this.
+        In the median of the glimpses: it may pass other things of its colours.
+        """
+        half = np.diag([0.5, 0.5, 1.0]) @ self.camera_matrix
+        shares = []
+        for glimpse in self.glimpses:
+            now = self.estimates[glimpse.index]
+            window = render_depth(self.mesh.vertices_m, self.mesh.faces, now.T_camera_object, half)
+            if now.visible and window is not None:
+                silhouette = window.mask_in_image(glimpse.evidence.shape[1], glimpse.evidence.shape[0])
+                shares.append(spilled_share(silhouette, glimpse.evidence, glimpse.near_edge < 0))
+        return float(np.median(shares)) if shares else 0.0
 
     @property
     def spin_source(self) -> str:

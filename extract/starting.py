@@ -111,12 +111,14 @@ def start_object(
     camera_matrix: Array,
     mask: Mask | None = None,
     labels: NDArray[np.uint8] | None = None,
+    standing: bool = True,
 ) -> Start:
     """What the object may be and how it may stand in the start frame, fitted coarsely, best first.
 
     In that one of the boxes, places where it may be, of which most is explained.
     rgb, boxes, camera_matrix and mask (cut from the box when None) are at the starting resolution.
     labels: (H, W) of the background, at any resolution, where it is known.
+    standing: whether it stands upright more likely than not; otherwise what it may be is of several kinds.
     Raises NotFoundError when no pose of any candidate explains what is there.
     """
     # Coarse first: at full sharpness highlights and texture tear the mask apart.
@@ -131,7 +133,8 @@ def start_object(
             if rgb[y : y + h, x : x + w].std(axis=(0, 1)).max() < FLAT_GREY_LEVELS:
                 raise NotFoundError(f"object {request.name!r} was not found: the frame is of one colour there")
             there = scaled(box, shrink)
-            found.append((box, _fits_in(there, request, candidates, small, source, camera, small_mask, labels)))
+            fits = _fits_in(there, request, candidates, small, source, camera, small_mask, labels, standing)
+            found.append((box, fits))
         except NotFoundError as error:
             refusal = error
     if not found:
@@ -172,6 +175,7 @@ def _fits_in(
     camera_matrix: Array,
     mask: Mask | None,
     labels: NDArray[np.uint8] | None,
+    standing: bool,
 ) -> list[_Fit]:
     """The best first poses of any model in a box, the vessel's shape fitted coarsely to each; the best of these first.
 
@@ -181,7 +185,7 @@ def _fits_in(
     trust = _trust(cut, labels)
     ranked: list[tuple[PoseCandidate, Model]] = []
     for model in candidates:
-        poses = find_first_pose(model, rgb, cut, camera_matrix, box_xywh_px=box, trust=trust)
+        poses = find_first_pose(model, rgb, cut, camera_matrix, box_xywh_px=box, trust=trust, standing=standing)
         ranked += [(pose, model) for pose in distinct(poses, APART_DEG, HYPOTHESES, HYPOTHESES_WITHIN, model.symmetry)]
     ranked.sort(key=lambda entry: entry[0].merit, reverse=True)
     if ranked[0][0].iou < FOUND_IOU:
@@ -189,6 +193,10 @@ def _fits_in(
             f"object {request.name!r} was not found: the best silhouette covers only {ranked[0][0].iou:.0%} of what "
             "was cut out of the frame"
         )
+    if not standing:
+        # Other kinds of pose are asked for then, not the same of several models.
+        kinds = distinct([pose for pose, _ in ranked], APART_DEG, HYPOTHESES, HYPOTHESES_WITHIN, ranked[0][1].symmetry)
+        ranked = [entry for entry in ranked if any(entry[0] is kind for kind in kinds)]
     fits = [
         _fitted(model, pose, rgb, cut, box, source, camera_matrix, labels, 1, COARSE_STEPS_PX)
         for pose, model in ranked[:HYPOTHESES]
@@ -230,18 +238,18 @@ def _fitted(
     T = pose.T_camera_object
     evidence = _evidence(model.mesh, rgb, T, camera_matrix, mask, band_px)
     trust = _trust(evidence, labels)
-    pose = before = judge(model.mesh, T, camera_matrix, edges, evidence, box, model.vessel is not None, trust)
+    pose = before = judge(model.mesh, T, camera_matrix, edges, evidence, box, pose.stands, trust)
     for number in range(rounds):
         if model.vessel is None:
             break
         if number > 0:  # after the last one only what is kept needs a mask
             evidence = _evidence(model.mesh, rgb, T, camera_matrix, evidence, band_px)
             trust = _trust(evidence, labels)
-            before = judge(model.mesh, T, camera_matrix, edges, evidence, box, trust=trust)
+            before = judge(model.mesh, T, camera_matrix, edges, evidence, box, pose.stands, trust)
         view = View(*mask_evidence(evidence, trust), T, box if source == "given" else None, edges)
         vessel, (T_fitted,) = fit_shape(model.vessel, [view], camera_matrix, steps_px)
         fitted = vessel_model(vessel)
-        after = judge(fitted.mesh, T_fitted, camera_matrix, edges, evidence, box, trust=trust)
+        after = judge(fitted.mesh, T_fitted, camera_matrix, edges, evidence, box, pose.stands, trust)
         if after.merit <= before.merit + 0.002:
             break  # a mask that lost a thin part misled the fit: edges and box tell
         model, T, pose = fitted, T_fitted, after

@@ -39,6 +39,11 @@ class SurfaceFlow:
     before_px: Array
     after_px: Array
 
+    @property
+    def moved_px(self) -> float:
+        """How far the points went, in the median."""
+        return float(np.median(np.linalg.norm(self.after_px - self.before_px, axis=1)))
+
 
 class CarriedPoints:
     """Corners inside the silhouette (H, W) of one frame on their way through those that follow, forward or backward."""

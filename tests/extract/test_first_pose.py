@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from vid2demo.extract.candidates import ObjectRequest, candidate_models
 from vid2demo.extract.first_pose import PoseCandidate, distinct, is_upright, silhouette_ious, upright_rotation
 from vid2demo.extract.geometry import Symmetry, make_pose
 from vid2demo.extract.raster import render_depth
 from vid2demo.extract.region import TrackingMesh
 from vid2demo.extract.segment import mask_box
+from vid2demo.extract.starting import APART_DEG, start_object
 
 
 @pytest.mark.parametrize(
@@ -98,3 +100,22 @@ def test_silhouettes_are_compared_with_masks_in_the_image_and_as_far_as_these_ar
     else:
         assert found[0] == pytest.approx(weight[silhouette & mask].sum() / weight[silhouette | mask].sum())
         assert found[1] == pytest.approx(1.0)
+
+
+def test_what_need_not_stand_is_several_things_turned_otherwise() -> None:
+    """A bottle that hangs with its neck down and toward the camera, painted in one colour."""
+    request = ObjectRequest("bottle")
+    models = candidate_models(request)
+    K = np.array([[600.0, 0.0, 320.0], [0.0, 600.0, 240.0], [0.0, 0.0, 1.0]])
+    T = make_pose(upright_rotation(35, 0, 160), (0.0, 0.0, 0.9))
+    window = render_depth(models[0].mesh.vertices_m, models[0].mesh.faces, T, K)
+    assert window is not None
+    mask = window.mask_in_image(640, 480)
+    rgb = np.where(mask[..., None], (200, 170, 30), (90, 90, 95)).astype(np.uint8)
+    start = start_object(request, models, rgb, [mask_box(mask)], "given", K, standing=False)
+    axes = np.array([h.pose.T_camera_object[:3, 2] for h in start.hypotheses])
+    assert len(axes) > 1
+    angles_deg = np.rad2deg(np.arccos(np.clip(axes @ axes.T, -1, 1)))[~np.eye(len(axes), dtype=bool)]
+    assert angles_deg.min() > APART_DEG - 5  # the fit that follows moves them a little
+    assert np.rad2deg(np.arccos(axes @ T[:3, 2])).min() < 15  # what it is, is among them
+    assert not any(h.pose.stands for h in start.hypotheses)

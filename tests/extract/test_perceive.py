@@ -115,7 +115,7 @@ def test_what_was_followed_unsurely_is_looked_for_in_a_wider_box_as_well(
     monkeypatch.setattr("vid2demo.extract.attempts.SURELY_BEGUN", 1.1)  # nothing is
     kept = follow(clip, mesh_file, tmp_path / "kept")  # of what is as sure the first
     assert np.array_equal(kept.T_camera_object, plain.T_camera_object)
-    monkeypatch.setattr("vid2demo.extract.attempts.OTHER_BOX_MARGIN", -1.0)
+    monkeypatch.setattr("vid2demo.extract.attempts.OTHER_MARGIN", -1.0)
     with monkeypatch.context() as strict:
         strict.setattr("vid2demo.extract.attempts.SAME_PLACE_IOU", 1.0)  # nor is anything the same object
         other = follow(clip, mesh_file, tmp_path / "other")

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import json
 from itertools import islice
 from pathlib import Path
 
 import numpy as np
 import pytest
+from vid2demo.extract.compare import compare_tracks, load_truth
 from vid2demo.extract.errors import UserError
 from vid2demo.extract.perceive import ObjectRequest, extract
 from vid2demo.extract.video import VideoWriter, iterate_frames
 
 VIDEOS = Path(__file__).parents[2].parent / "shared" / "data" / "videos"
 COFFEE, BOX_TURN = VIDEOS / "coffee_pour.mp4", VIDEOS / "box_turn.mp4"
+MUSTARD = VIDEOS.parent / "tracking/mustard_a"
 KETTLE_BOX_PX = (345.0, 297.0, 488.0, 342.0)
 # Frame -> tilt of the kettle's body in the image, from the slopes of its base and rim, +-2 degrees.
 TILT_BY_EYE_DEG = {
@@ -44,3 +47,13 @@ def test_a_teapot_is_not_found_where_a_box_is_turned(tmp_path: Path) -> None:
             writer.write(frame.rgb)
     with pytest.raises(UserError, match="'teapot' was not found"):
         extract(fewer, [ObjectRequest("teapot")], out=tmp_path / "out")
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+@pytest.mark.skipif(not MUSTARD.exists(), reason=f"needs the recording {MUSTARD}")
+def test_a_bottle_that_hangs_upside_down_is_followed_as_one_of_the_library_s(tmp_path: Path) -> None:
+    box = tuple(json.loads((MUSTARD / "info.json").read_text())["box_first_frame_xywh_px"])
+    track = extract(MUSTARD / "video.mp4", [ObjectRequest("bottle", box)], out=tmp_path)["bottle"]
+    assert track.visible.all()
+    assert compare_tracks(track, load_truth(MUSTARD / "truth.npz")).pose.aligned_rotation_deg < 10.0
