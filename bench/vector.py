@@ -27,7 +27,7 @@ import gymnasium as gym
 import numpy as np
 import vid2demo  # noqa: F401 (registers the environments)
 from vid2demo.envs.builtin import arm_trajectory
-from vid2demo.envs.crew import Crew
+from vid2demo.extract.crew import Crew
 
 CASES: dict[str, tuple[str, dict[str, Any]]] = {
     "PandaTrack": ("PandaTrack-v0", {"termination": "never"}),

@@ -16,8 +16,8 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from ..extract.crew import Crew, usable_cpus
 from ..extract.errors import UserError
-from .crew import Crew, usable_cpus
 from .pouring import Info, Observation, PandaPourEnv
 from .tracking import PandaTrackEnv
 

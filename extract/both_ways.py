@@ -9,11 +9,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import takewhile
 
 import numpy as np
 
 from .background import Background
 from .camera_motion import CameraWatch
+from .crew import side_by_side
 from .cuts import CutWatch
 from .depth_video import DepthVideo, DepthView
 from .follow import Followed
@@ -65,21 +67,26 @@ def settle_rivals(clip: Clip, starts: Sequence[Start]) -> list[Start]:
     """
     if all(len(start.hypotheses) == 1 for start in starts):
         return list(starts)
-    rivals = [range(len(start.hypotheses)) if len(start.hypotheses) > 1 else () for start in starts]
-    sure: dict[tuple[int, int], list[float]] = {}
+    rivals = [
+        (n, k) for n, start in enumerate(starts) if len(start.hypotheses) > 1 for k in range(len(start.hypotheses))
+    ]
+    sure: dict[tuple[int, int], list[float]] = {rival: [] for rival in rivals}
     before: list[float] = []
 
     def tried(frames: Iterable[Frame]) -> None:
-        trials = {(n, k): _begun(clip, starts[n], k).tracker for n, ks in enumerate(rivals) for k in ks}
-        for frame in frames:
-            away = abs(frame.index - clip.start_index)
-            if away > TRIAL_FRAMES:
-                break
-            depth = clip.depth_of(frame.index)
-            for key, tracker in trials.items():
-                tracker.step(frame.rgb, None, depth)
+        near = takewhile(lambda frame: abs(frame.index - clip.start_index) <= TRIAL_FRAMES, frames)
+        seen = [(frame.rgb, clip.depth_of(frame.index)) for frame in near]
+
+        def followed(rival: tuple[int, int]) -> list[float]:
+            tracker, confidence = _begun(clip, starts[rival[0]], rival[1]).tracker, []
+            for rgb, depth in seen:
+                tracker.step(rgb, None, depth)
                 # Texture holds on to any shape: only the outline tells whether it is the right one.
-                sure.setdefault(key, []).append(replace(tracker.signs, rigid=0.0).confidence)
+                confidence.append(replace(tracker.signs, rigid=0.0).confidence)
+            return confidence
+
+        for rival, confidence in zip(rivals, side_by_side(followed, rivals), strict=True):
+            sure[rival] += confidence
 
     def ahead() -> Iterator[Frame]:
         for frame in iterate_frames(clip.info.path, WORKING_SIDE_PX, clip.info):
@@ -91,9 +98,9 @@ def settle_rivals(clip: Clip, starts: Sequence[Start]) -> list[Start]:
     tried(ahead())
     if clip.start_index > 0:
         tried(iterate_backward(clip.info.path, before, WORKING_SIDE_PX))
-    means = {key: float(np.mean(values)) for key, values in sure.items()}
+    means = {rival: float(np.mean(confidence or 0.0)) for rival, confidence in sure.items()}
     return [
-        start.preferring(_surest([means.get((n, k), 0.0) for k in rivals[n]])) if rivals[n] else start
+        start.preferring(_surest([means.get((n, k), 0.0) for k in range(len(start.hypotheses))]))
         for n, start in enumerate(starts)
     ]
 

@@ -84,7 +84,7 @@ def crease_pixels(
     return np.stack([xs, ys], axis=1), across[ys, xs].astype(float), jumps[ys, xs]
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def find_creases(
     depth: NDArray[np.float32], fx: float, fy: float, jump_m: float, clear_px: int
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
@@ -155,7 +155,7 @@ def find_creases(
     return across, jumps
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _measure(
     pixel: Array, normal: Array, edges: NDArray[np.float32], told: NDArray[np.bool_], step_px: float,
     mean_px: Array, variance: Array,

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
+from itertools import chain
 
 import cv2
 import numba
@@ -16,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .colours import mask_evidence
+from .crew import side_by_side
 from .first_pose import edge_score, silhouette_ious, upright_rotation
 from .geometry import Array, make_pose, projected_box, scaled_camera
 from .handled import Handled, find_handled, reach_from_border
@@ -121,9 +124,8 @@ def find_places(
         places = small_moved > MOVED_SHARE
     held = find_handled(rgb, labels) if handled and labels is not None else None
     arm = _Arm.of(small_moved > MOVED_SHARE, held) if handled else None
-    matches: list[_Match] = []
-    for index, mesh in enumerate(meshes):
-        matches += _slide(index, mesh, edges, small_camera, places)
+    slide = partial(_slide, meshes, edges, small_camera, places)
+    matches = list(chain.from_iterable(side_by_side(slide, range(len(meshes)))))
     matches.sort(key=lambda m: m.score, reverse=True)
 
     small_taken = [cv2.resize(mask.astype(np.uint8), size) > 0 for mask in taken]
@@ -188,10 +190,14 @@ def _edge_maps(rgb: Image) -> NDArray[np.float32]:
 
 
 def _slide(
-    index: int, mesh: TrackingMesh, edges: NDArray[np.float32], camera_matrix: Array, places: NDArray[np.bool_]
+    meshes: Sequence[TrackingMesh],
+    edges: NDArray[np.float32],
+    camera_matrix: Array,
+    places: NDArray[np.bool_],
+    index: int,
 ) -> list[_Match]:
-    """Best places of every template of one mesh, its centre where `places` (H, W) allow it."""
-    height, width = places.shape
+    """Best places of every template of one of the meshes, its centre where `places` (H, W) allow it."""
+    mesh, (height, width) = meshes[index], places.shape
     longest = max(height, width)
     centre = np.array([width / 2, height / 2])
     inverse = np.linalg.inv(camera_matrix)
@@ -228,7 +234,7 @@ def _slide(
     return matches
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _add_up(
     edges: NDArray[np.float32], bins: NDArray[np.int_], offset: NDArray[np.int_], places: NDArray[np.bool_],
     total: NDArray[np.float32],

@@ -7,7 +7,7 @@ object's +z axis up in the image are tried on a finer grid and win ties; every o
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -21,8 +21,9 @@ from .candidates import Model
 from .colours import mask_evidence
 from .first_search import place_in_box, silhouettes_agree
 from .geometry import Array, Symmetry, make_pose, super_fibonacci_rotations
-from .raster import render_depth
-from .region import Outline, TrackingMesh, edge_strength, extract_outline, refine
+from .meshes import THINNING
+from .raster import DepthWindow, render_depth
+from .region import Outline, TrackingMesh, draw_outline, draw_window, edge_strength, refine, trace_outline
 from .segment import Box, Mask, box_iou, mask_box
 from .video import Image
 
@@ -46,7 +47,7 @@ class PoseCandidate:
     iou: intersection over union of its silhouette with the mask.  box_iou: of its bounding box with the given box,
     which counts thin parts that masks lose.  edge: share of its outline that runs along image edges, which tells
     poses apart where the mask is wrong.  stands: whether an upright pose is likelier than others, which can only be
-    said of objects whose +z is known to point up.
+    said of objects whose +z is known to point up.  outline: as it was drawn to judge the pose, if it was.
     """
 
     T_camera_object: Array
@@ -54,6 +55,7 @@ class PoseCandidate:
     box_iou: float
     edge: float = 0.0
     stands: bool = True
+    outline: Outline | None = field(default=None, repr=False, compare=False)
 
     @cached_property
     def merit(self) -> float:
@@ -116,7 +118,7 @@ def find_first_pose(
         for candidate in chosen:
             result = refine(
                 model.mesh, candidate.T_camera_object, camera_matrix, bins, colours, steps_px=steps_px,
-                prior_rotation_rad=0.12, prior_translation=0.05, prior_depth=0.1,
+                prior_rotation_rad=0.12, prior_translation=0.05, prior_depth=0.1, outline=candidate.outline,
             )  # fmt: skip
             found.append(judge(model.mesh, result.T_camera_object, camera_matrix, edges, mask, box, stands, trust))
         found.sort(key=lambda c: c.merit, reverse=True)
@@ -134,9 +136,12 @@ def judge(
     trust: NDArray[np.float32] | None = None,
 ) -> PoseCandidate:
     """How well a pose explains the edges of an image, the mask cut from it and the box around the object."""
-    ious = silhouette_ious(mesh, T_camera_object, camera_matrix, mask, box, trust)
-    edge = edge_score(mesh, T_camera_object, camera_matrix, edges, trust)
-    return PoseCandidate(T_camera_object, *ious, edge, stands)
+    window = draw_window(mesh, T_camera_object, camera_matrix)
+    if window is None:
+        return PoseCandidate(T_camera_object, 0.0, 0.0, 0.0, stands)
+    outline = trace_outline(window, mesh, T_camera_object, camera_matrix)
+    edge = _share_explained(outline, T_camera_object, camera_matrix, edges, trust)
+    return PoseCandidate(T_camera_object, *_ious(window, mask, box, trust), edge, stands, outline)
 
 
 def distinct(
@@ -169,8 +174,10 @@ def silhouette_ious(
     Pixels count as far as the mask is to be trusted there.
     """
     window = render_depth(mesh.vertices_m, mesh.faces, T_camera_object, camera_matrix)
-    if window is None:
-        return 0.0, 0.0
+    return (0.0, 0.0) if window is None else _ious(window, mask, box_xywh_px, trust)
+
+
+def _ious(window: DepthWindow, mask: Mask, box_xywh_px: Box, trust: NDArray[np.float32] | None) -> tuple[float, float]:
     silhouette, place = window.part_in_image(mask.shape[1], mask.shape[0])
     if not silhouette.any():
         return 0.0, 0.0
@@ -198,7 +205,18 @@ def edge_score(
     Within 2 px, and not counting where the mask is not to be trusted at all: the edges there are those of a hand.
     Bends of a surface need not show.
     """
-    outline = extract_outline(mesh, T_camera_object, camera_matrix, (strength.shape[0], strength.shape[1]))
+    outline = draw_outline(mesh, T_camera_object, camera_matrix)
+    return _share_explained(outline, T_camera_object, camera_matrix, strength, trust)
+
+
+def _share_explained(
+    outline: Outline | None,
+    T_camera_object: Array,
+    camera_matrix: Array,
+    strength: NDArray[np.float32],
+    trust: NDArray[np.float32] | None,
+) -> float:
+    outline = None if outline is None else outline.inside((strength.shape[0], strength.shape[1]))
     if outline is None:
         return 0.0
     pixel, normal = outline.pixel, outline.normal
@@ -254,7 +272,8 @@ def _with_few_faces(mesh: TrackingMesh) -> tuple[Array, NDArray[np.int32]]:
     """Vertices (V, 3) and faces (F, 3) of the mesh with SEARCH_FACES at most."""
     if len(mesh.faces) <= SEARCH_FACES:
         return mesh.vertices_m, mesh.faces
-    vertices, faces = fast_simplification.simplify(mesh.vertices_m, mesh.faces, target_count=SEARCH_FACES)[:2]
+    with THINNING:
+        vertices, faces = fast_simplification.simplify(mesh.vertices_m, mesh.faces, target_count=SEARCH_FACES)[:2]
     return np.ascontiguousarray(vertices, float), np.ascontiguousarray(faces, np.int32)
 
 

@@ -52,7 +52,7 @@ def silhouettes_agree(
     return ious
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _compare(
     vertices_m: Array, faces: NDArray[np.int32], rotations: Array, origins_m: Array, camera_matrix: Array, mask: Mask,
     trust: NDArray[np.float32], box: Array, ious: Array,
@@ -93,7 +93,7 @@ def _compare(
         ious[n, 1] = both / ((right + 1 - left) * (bottom + 1 - top) + box[2] * box[3] - both)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _fill(pixels: Array, corners: NDArray[np.int32], drawn: NDArray[np.bool_]) -> None:
     """Set the pixels (H, W) whose centres lie in a triangle of `pixels` (V, 2)."""
     height, width = drawn.shape

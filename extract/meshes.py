@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import math
+import threading
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -31,6 +32,7 @@ TYPICAL_M = 0.16
 UNIT_RARITY = {"m": 0.0, "mm": 0.2, "cm": 0.3, "in": 1.0}
 
 _log = logging.getLogger(__name__)
+THINNING = threading.Lock()  # fast_simplification keeps the mesh that it works on in global variables
 
 
 def load_mesh(path: Path | str, unit: str = "auto", *, max_faces: int | None = 60_000) -> Any:
@@ -229,7 +231,8 @@ def _decimated(
     # Texture seams cut the surface open and the collapse would tear it there: weld first.
     welded, first, inverse = np.unique(vertices, axis=0, return_index=True, return_inverse=True)
     faces = inverse.ravel()[faces]
-    points, triangles = fast_simplification.simplify(welded, faces, target_count=max_faces)[:2]
+    with THINNING:
+        points, triangles = fast_simplification.simplify(welded, faces, target_count=max_faces)[:2]
     points = np.asarray(points, np.float64)
     _, nearest = cKDTree(welded).query(points)
     return points, np.asarray(triangles, np.int64), colors[first][nearest]

@@ -96,7 +96,7 @@ def render_depth(
     return DepthWindow(depth, int(low[0]), int(low[1]))
 
 
-@numba.njit(cache=True, fastmath=True)
+@numba.njit(cache=True, nogil=True, fastmath=True)
 def _fill(uv: Array, z: Array, faces: NDArray[np.int32], closed: bool, depth: NDArray[np.float32]) -> None:
     """Z-buffer with 1/z interpolated linearly on the image plane, which is exact for planes in perspective.
 
@@ -154,7 +154,7 @@ def _fill(uv: Array, z: Array, faces: NDArray[np.int32], closed: bool, depth: ND
             pixels[i] = 0.0
 
 
-@numba.njit(cache=True, fastmath=True)
+@numba.njit(cache=True, nogil=True, fastmath=True)
 def _draw_rows(
     place: NDArray[np.int64], count: NDArray[np.int64], begin: Array, along: Array, pixels: NDArray[np.float32]
 ) -> None:

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from .colours import HIDDEN_BIN, LOCAL_CENTRES, ColourModel
 from .creases import Creases, draw_creases
 from .geometry import Array, invert_pose, make_pose, project, shows_same_side, transform_points, unproject
-from .raster import render_depth
+from .raster import DepthWindow, render_depth
 from .region_kernels import free_lengths, learn_lines, measure_lines, solve_pose, strongest_gradient
 from .video import Image, softened
 
@@ -151,9 +151,24 @@ def draw_outline(
     mesh: TrackingMesh, T_camera_object: Array, camera_matrix: Array, count: int = 300, with_creases: bool = True
 ) -> Outline | None:
     """Sample the whole boundary of the silhouette, in the image or not; None when the object cannot be drawn."""
-    window = render_depth(mesh.vertices_m, mesh.faces, T_camera_object, camera_matrix, margin_px=24)
-    if window is None:
-        return None
+    window = draw_window(mesh, T_camera_object, camera_matrix)
+    return None if window is None else trace_outline(window, mesh, T_camera_object, camera_matrix, count, with_creases)
+
+
+def draw_window(mesh: TrackingMesh, T_camera_object: Array, camera_matrix: Array) -> DepthWindow | None:
+    """The mesh drawn at a pose, with as much around it as `trace_outline` needs; None when it cannot be drawn."""
+    return render_depth(mesh.vertices_m, mesh.faces, T_camera_object, camera_matrix, margin_px=24)
+
+
+def trace_outline(
+    window: DepthWindow,
+    mesh: TrackingMesh,
+    T_camera_object: Array,
+    camera_matrix: Array,
+    count: int = 300,
+    with_creases: bool = True,
+) -> Outline | None:
+    """`draw_outline` of what `draw_window` drew."""
     mask = window.mask.astype(np.uint8)
     contours, _ = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     contours = [c for c in contours if len(c) >= 8]

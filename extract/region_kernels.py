@@ -22,7 +22,7 @@ INSIDE_SHARE = 0.5 - AMPLITUDE * np.tanh(np.arange(2 * HALF_LINE, -2 * HALF_LINE
 OUTSIDE_SHARE = 1.0 - INSIDE_SHARE
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def free_lengths(
     contour: Array, normal: Array, mask: NDArray[np.uint8], inside: NDArray[np.float32], outside: NDArray[np.float32]
 ) -> None:
@@ -47,7 +47,7 @@ def free_lengths(
                 outside[i] = length
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def count_bins(lab: NDArray[np.uint8], bits: int, chroma_step: int, bins: NDArray[np.int32]) -> None:
     """Histogram bin of every pixel of (H, W, 3) in 8-bit Lab, `bits` a channel, into `bins` (H, W).
 
@@ -64,7 +64,7 @@ def count_bins(lab: NDArray[np.uint8], bits: int, chroma_step: int, bins: NDArra
             bins[y, x] = light[lab[y, x, 0]] + chroma[lab[y, x, 1]] * side + chroma[lab[y, x, 2]]
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def hide_bins(
     bins: NDArray[np.int32], covered: NDArray[np.bool_], alien: NDArray[np.bool_], hidden: int,
     counts: NDArray[np.float32],
@@ -80,7 +80,7 @@ def hide_bins(
                 bins[y, x] = hidden
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def look_up(table: NDArray[np.float32], bins: NDArray[np.int32], out: NDArray[np.float32]) -> None:
     """What a table (BINS,) has for every bin, into `out`, which is of their shape (H, W)."""
     for y in range(bins.shape[0]):
@@ -88,7 +88,7 @@ def look_up(table: NDArray[np.float32], bins: NDArray[np.int32], out: NDArray[np
             out[y, x] = table[bins[y, x]]
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def strongest_gradient(soft: NDArray[np.uint8], scale: float, out: NDArray[np.float32]) -> None:
     """Sobel's gradient times `scale` of the channel where it is longest, (H, W, 2); 0 at the image's border.
 
@@ -113,7 +113,7 @@ def strongest_gradient(soft: NDArray[np.uint8], scale: float, out: NDArray[np.fl
     out[0], out[-1], out[:, 0], out[:, -1] = 0.0, 0.0, 0.0, 0.0
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def smooth_histogram(histogram: NDArray[np.float32], side: int) -> None:
     """Normalise a histogram of side^3 bins, spread over neighbouring bins so that small samples do not overfit."""
     # Only the box of bins that are taken or next to one that is: few colours are near each other.
@@ -142,7 +142,7 @@ def smooth_histogram(histogram: NDArray[np.float32], side: int) -> None:
     histogram /= max(total, np.float32(1e-12))
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def learn_lines(
     pixel: Array, normal: Array, inside: NDArray[np.float32], outside: NDArray[np.float32],
     nearest: NDArray[np.int32], bins: NDArray[np.int32],
@@ -188,7 +188,7 @@ def learn_lines(
         seen[k] = 1.0
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def measure_lines(
     pixel: Array, normal: Array, inside: NDArray[np.float32], outside: NDArray[np.float32],
     nearest: NDArray[np.int32], bins: NDArray[np.int32],
@@ -265,7 +265,7 @@ def measure_lines(
         gain[i] = (log_p[HALF_LINE] - 0.5 * (log_p[0] + log_p[n - 1])) / n
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def solve_pose(
     line_point: Array, target: Array, normal: Array, inverse_variance: Array, step_px: float,
     point: Array, pixel: Array, point_weight: Array, point_limit_px: float, camera_matrix: Array,
@@ -329,7 +329,7 @@ def solve_pose(
     return cost
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _exp(x: float, y: float, z: float) -> Array:
     """Rotation (3, 3) by a rotation vector."""
     angle = np.sqrt(x * x + y * y + z * z)
@@ -341,7 +341,7 @@ def _exp(x: float, y: float, z: float) -> Array:
     return whole
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _log(R: Array, R_from: Array) -> Array:
     """Rotation vector (3,) of the turn from one rotation to another, by less than half a turn."""
     turn = np.zeros((3, 3))
@@ -356,7 +356,7 @@ def _log(R: Array, R_from: Array) -> Array:
     return axis
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def draw_view(
     depth: NDArray[np.float32], x0: int, y0: int, camera_matrix: Array, T_key_camera: Array,
     key_depth: NDArray[np.float32], key_x0: int, key_y0: int, key_picture: NDArray[np.uint8], key_camera: Array,

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from .colours import ColourModel
 from .geometry import Array, extent, pose_change, project, transform_points
+from .meshes import THINNING
 from .raster import render_depth
 from .region import Lines, TrackingMesh, measure
 from .segment import Box
@@ -56,7 +57,8 @@ def tracking_mesh(vessel: Vessel, faces: int = TRACKING_FACES) -> TrackingMesh:
     """The vessel's mesh, light enough to be drawn several times a frame."""
     mesh = vessel.mesh
     if len(mesh.faces) > faces:
-        mesh = mesh.simplify_quadric_decimation(face_count=faces)
+        with THINNING:
+            mesh = mesh.simplify_quadric_decimation(face_count=faces)
     return TrackingMesh.build(np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int32))
 
 

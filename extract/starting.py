@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Any
 
 import cv2
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from .background import mask_trust
 from .candidates import Model, ObjectRequest, vessel_model
 from .colours import mask_evidence
+from .crew import side_by_side
 from .errors import UserError
 from .first_pose import PoseCandidate, distinct, find_first_pose, judge
 from .geometry import Array, scaled_camera
@@ -183,10 +185,12 @@ def _fits_in(
     """
     cut = mask_from_box(rgb, box) if mask is None else mask
     trust = _trust(cut, labels)
-    ranked: list[tuple[PoseCandidate, Model]] = []
-    for model in candidates:
+
+    def first_poses(model: Model) -> list[tuple[PoseCandidate, Model]]:
         poses = find_first_pose(model, rgb, cut, camera_matrix, box_xywh_px=box, trust=trust, standing=standing)
-        ranked += [(pose, model) for pose in distinct(poses, APART_DEG, HYPOTHESES, HYPOTHESES_WITHIN, model.symmetry)]
+        return [(pose, model) for pose in distinct(poses, APART_DEG, HYPOTHESES, HYPOTHESES_WITHIN, model.symmetry)]
+
+    ranked = list(chain.from_iterable(side_by_side(first_poses, candidates)))
     ranked.sort(key=lambda entry: entry[0].merit, reverse=True)
     if ranked[0][0].iou < FOUND_IOU:
         raise NotFoundError(
@@ -197,10 +201,12 @@ def _fits_in(
         # Other kinds of pose are asked for then, not the same of several models.
         kinds = distinct([pose for pose, _ in ranked], APART_DEG, HYPOTHESES, HYPOTHESES_WITHIN, ranked[0][1].symmetry)
         ranked = [entry for entry in ranked if any(entry[0] is kind for kind in kinds)]
-    fits = [
-        _fitted(model, pose, rgb, cut, box, source, camera_matrix, labels, 1, COARSE_STEPS_PX)
-        for pose, model in ranked[:HYPOTHESES]
-    ]
+
+    def fitted(entry: tuple[PoseCandidate, Model]) -> _Fit:
+        pose, model = entry
+        return _fitted(model, pose, rgb, cut, box, source, camera_matrix, labels, 1, COARSE_STEPS_PX)
+
+    fits = side_by_side(fitted, ranked[:HYPOTHESES])
     return sorted(fits, key=lambda fit: fit.pose.merit, reverse=True)
 
 

@@ -4,7 +4,7 @@ import threading
 import time
 
 import pytest
-from vid2demo.envs.crew import Crew, usable_cpus
+from vid2demo.extract.crew import Crew, usable_cpus
 
 
 @pytest.mark.parametrize("threads", [1, 2, 5])
