@@ -6,14 +6,16 @@ coordinates, and the window may reach beyond the image so that an object half ou
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from .geometry import Array, extent, project, transform_points
+from .geometry import Array
 
+NEAREST_M = 1e-3  # that a vertex may be before the camera
 FAR_M = np.float32(1e30)  # of pixels where nothing was drawn yet
 WAITING = 2048  # rows of triangles that are listed before they are drawn
 LEAST_SLOPE = 1e-12  # of a barycentric weight along a row: what changes less does not change
@@ -82,40 +84,65 @@ def render_depth(
     closed: the faces are known to be closed surfaces, counter-clockwise seen from outside, so that those that look
     away need not be drawn.
     """
-    points = transform_points(T_camera_object, vertices_m)
-    if points[:, 2].min() < 1e-3:
+    pixels, inverse = np.empty((len(vertices_m), 2)), np.empty(len(vertices_m))
+    left, top, right, bottom = _place(vertices_m, T_camera_object, camera_matrix, pixels, inverse)
+    if left > right:
         return None
-    pixels = project(camera_matrix, points)
-    lowest, highest = extent(pixels)
-    low = np.floor(lowest).astype(int) - margin_px
-    size = np.ceil(highest).astype(int) + margin_px + 1 - low
-    if size.max() > max_side_px:
+    x0_px, y0_px = math.floor(left) - margin_px, math.floor(top) - margin_px
+    width, height = math.ceil(right) + margin_px + 1 - x0_px, math.ceil(bottom) + margin_px + 1 - y0_px
+    if max(width, height) > max_side_px:
         return None
-    depth = np.empty((size[1], size[0]), np.float32)
-    _fill(pixels - low, points[:, 2], faces, closed, depth)
-    return DepthWindow(depth, int(low[0]), int(low[1]))
+    depth = np.empty((height, width), np.float32)
+    _fill(pixels, inverse, x0_px, y0_px, faces, closed, depth)
+    return DepthWindow(depth, x0_px, y0_px)
+
+
+@numba.njit(cache=True, nogil=True)
+def _place(
+    vertices_m: Array, T: Array, camera_matrix: Array, pixels: Array, inverse: Array
+) -> tuple[float, float, float, float]:
+    """Where a pose shows vertices, into (V, 2), and one over their depths, into (V,).
+
+    Returns left, top, right and bottom end of that; right before left when one is not before the camera.
+    """
+    fx, fy, cx, cy = camera_matrix[0, 0], camera_matrix[1, 1], camera_matrix[0, 2], camera_matrix[1, 2]
+    left, top, right, bottom = np.inf, np.inf, -np.inf, -np.inf
+    for i in range(vertices_m.shape[0]):
+        a, b, c = vertices_m[i, 0], vertices_m[i, 1], vertices_m[i, 2]
+        z = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c + T[2, 3]
+        if z < NEAREST_M:
+            return 0.0, 0.0, -1.0, -1.0
+        u = (fx * (T[0, 0] * a + T[0, 1] * b + T[0, 2] * c + T[0, 3]) + cx * z) / z
+        v = (fy * (T[1, 0] * a + T[1, 1] * b + T[1, 2] * c + T[1, 3]) + cy * z) / z
+        pixels[i, 0], pixels[i, 1], inverse[i] = u, v, 1.0 / z
+        left, top, right, bottom = min(left, u), min(top, v), max(right, u), max(bottom, v)
+    return left, top, right, bottom
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True)
-def _fill(uv: Array, z: Array, faces: NDArray[np.int32], closed: bool, depth: NDArray[np.float32]) -> None:
+def _fill(
+    pixels: Array, inverse: Array, x0: int, y0: int, faces: NDArray[np.int32], closed: bool, depth: NDArray[np.float32]
+) -> None:
     """Z-buffer with 1/z interpolated linearly on the image plane, which is exact for planes in perspective.
+
+    pixels (V, 2), inverse (V,): from `_place`.  x0, y0: where the window `depth` begins.
 
     Triangles are small: rows of them are listed first and drawn later, because a processor that waits for every row's
     ends before it knows how many pixels to draw spends most of its time waiting.
     """
     h, w = depth.shape
     depth[:] = FAR_M
-    pixels = depth.reshape(h * w)
-    inverse = 1.0 / z
+    flat = depth.reshape(h * w)
     place, count = np.empty(WAITING + h, np.int64), np.empty(WAITING + h, np.int64)
     begin, along = np.empty(WAITING + h), np.empty(WAITING + h)
     rows = 0
     for f in range(faces.shape[0]):
         if rows > WAITING:
-            _draw_rows(place[:rows], count, begin, along, pixels)
+            _draw_rows(place[:rows], count, begin, along, flat)
             rows = 0
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
-        ax, ay, bx, by, cx, cy = uv[a, 0], uv[a, 1], uv[b, 0], uv[b, 1], uv[c, 0], uv[c, 1]
+        ax, ay, bx = pixels[a, 0] - x0, pixels[a, 1] - y0, pixels[b, 0] - x0
+        by, cx, cy = pixels[b, 1] - y0, pixels[c, 0] - x0, pixels[c, 1] - y0
         area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
         x_a = max(int(np.ceil(min(ax, bx, cx))), 0)
         x_b = min(int(np.floor(max(ax, bx, cx))), w - 1)
@@ -148,10 +175,10 @@ def _fill(uv: Array, z: Array, faces: NDArray[np.int32], closed: bool, depth: ND
             begin[rows] = inverse[c] + u * rise_a + v * rise_b + first * slope
             along[rows] = slope
             rows += last >= first
-    _draw_rows(place[:rows], count, begin, along, pixels)
+    _draw_rows(place[:rows], count, begin, along, flat)
     for i in range(h * w):
-        if pixels[i] == FAR_M:
-            pixels[i] = 0.0
+        if flat[i] == FAR_M:
+            flat[i] = 0.0
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True)
