@@ -14,7 +14,6 @@ from scipy.spatial.transform import Rotation
 
 from .depth_video import DepthView
 from .geometry import Array, invert_pose, make_pose, pose_change, project, shows_same_side, transform_points
-from .raster import render_depth
 from .region import TrackingMesh
 
 DRAWN_SIDE_PX = 40.0  # of the object, where its surface is sampled
@@ -49,7 +48,7 @@ def draw_surface(mesh: TrackingMesh, T_camera_object: Array, camera_matrix: Arra
     """The surface that a mesh shows at a pose; None when it cannot be drawn."""
     size_px = 2 * mesh.radius_m * float(camera_matrix[0, 0]) / max(float(T_camera_object[2, 3]), 1e-3)
     camera = np.diag([DRAWN_SIDE_PX / size_px, DRAWN_SIDE_PX / size_px, 1.0]) @ camera_matrix
-    window = render_depth(mesh.vertices_m, mesh.faces, T_camera_object, camera)
+    window = mesh.drawn(T_camera_object, camera)
     if window is None:
         return None
     z = window.depth_m.astype(float)

@@ -22,7 +22,6 @@ from .crew import side_by_side
 from .first_pose import edge_score, silhouette_ious, upright_rotation
 from .geometry import Array, make_pose, projected_box, scaled_camera
 from .handled import Handled, find_handled, reach_from_border
-from .raster import render_depth
 from .region import TrackingMesh, draw_outline, edge_strength, refine
 from .segment import Box, Mask, box_iou, mask_box, mask_from_box
 from .video import Image
@@ -140,7 +139,7 @@ def find_places(
     found: list[tuple[float, float, Box]] = []
     for merit, match in _spread(judged, meshes, small_camera, REFINED):
         mesh, T = meshes[match.mesh], match.T_camera_object
-        window = render_depth(mesh.vertices_m, mesh.faces, T, camera_matrix)
+        window = mesh.drawn(T, camera_matrix)
         if window is None or not (silhouette := window.mask_in_image(rgb.shape[1], rgb.shape[0])).any():
             continue
         mask = mask_from_box(rgb, _grown(mask_box(silhouette), 0.06, rgb), CUT_ROUNDS)
@@ -148,7 +147,7 @@ def find_places(
             mesh, T, camera_matrix, *mask_evidence(mask), steps_px=(5, 3, 2, 1),
             prior_rotation_rad=0.12, prior_translation=0.05, prior_depth=0.1,
         ).T_camera_object  # fmt: skip
-        window = render_depth(mesh.vertices_m, mesh.faces, T, camera_matrix)
+        window = mesh.drawn(T, camera_matrix)
         if window is None or not (silhouette := window.mask_in_image(rgb.shape[1], rgb.shape[0])).any():
             continue
         box = mask_box(silhouette)
@@ -272,7 +271,7 @@ def _judge(
     arm: for what is handled: it must have moved, and is all there is at the end of an arm.
     """
     height, width = moved.shape
-    window = render_depth(mesh.vertices_m, mesh.faces, match.T_camera_object, camera_matrix)
+    window = mesh.drawn(match.T_camera_object, camera_matrix)
     if window is None:
         return -np.inf
     silhouette = window.mask_in_image(width, height)

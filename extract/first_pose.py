@@ -22,7 +22,7 @@ from .colours import mask_evidence
 from .first_search import place_in_box, silhouettes_agree
 from .geometry import Array, Symmetry, make_pose, super_fibonacci_rotations
 from .meshes import THINNING
-from .raster import DepthWindow, render_depth
+from .raster import DepthWindow
 from .region import Outline, TrackingMesh, draw_outline, draw_window, edge_strength, refine, trace_outline
 from .segment import Box, Mask, box_iou, mask_box
 from .video import Image
@@ -173,7 +173,7 @@ def silhouette_ious(
 
     Pixels count as far as the mask is to be trusted there.
     """
-    window = render_depth(mesh.vertices_m, mesh.faces, T_camera_object, camera_matrix)
+    window = mesh.drawn(T_camera_object, camera_matrix)
     return (0.0, 0.0) if window is None else _ious(window, mask, box_xywh_px, trust)
 
 

@@ -23,7 +23,6 @@ from .depth_size import scaled_vessel, size_of_clip
 from .depth_video import DepthView
 from .first_pose import edge_score
 from .geometry import Array, Symmetry, invert_pose
-from .raster import render_depth
 from .region import TrackingMesh, edge_strength
 from .segment import Mask
 from .shape_fit import View, fit_shape, tracking_mesh
@@ -125,7 +124,7 @@ class Followed:
         now = self.estimates[-1]
         if self.vessel is None or not now.visible:
             return None
-        seen = render_depth(self.mesh.vertices_m, self.mesh.faces, now.T_camera_object, self.camera_matrix)
+        seen = self.mesh.drawn(now.T_camera_object, self.camera_matrix)
         return None if seen is None else CarriedPoints(_grey(rgb), seen.mask_in_image(rgb.shape[1], rgb.shape[0]))
 
     def _glimpse(self, rgb: Image, index: int, depth: DepthView | None, whole: bool) -> Glimpse:
@@ -302,7 +301,7 @@ class Followed:
             if glimpse.edges is None:
                 continue
             total += edge_score(mesh, T, self.camera_matrix, glimpse.edges)
-            window = render_depth(mesh.vertices_m, mesh.faces, T, half)
+            window = mesh.drawn(T, half)
             if window is not None:
                 silhouette = window.mask_in_image(glimpse.evidence.shape[1], glimpse.evidence.shape[0])
                 most = float(np.maximum(glimpse.evidence, 0)[silhouette].sum())

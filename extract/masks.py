@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from .errors import UserError
 from .files import atomic_path
 from .geometry import Array, scaled_camera
-from .raster import render_depth
 from .region import TrackingMesh
 from .segment import Mask
 from .track import ObjectTrack, load_npz_with_header
@@ -93,7 +92,7 @@ class Masks:
 
 
 def _silhouette(mesh: TrackingMesh, T: Array, camera_matrix: Array, size: tuple[int, int]) -> Mask:
-    window = render_depth(mesh.vertices_m, mesh.faces, T, camera_matrix)
+    window = mesh.drawn(T, camera_matrix)
     return np.zeros((size[1], size[0]), bool) if window is None else window.mask_in_image(*size)
 
 

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .geometry import Array, invert_pose, project, scaled_camera, transform_points
-from .raster import render_depth
 from .region import TrackingMesh
 from .track import ObjectTrack
 from .video import Image, VideoWriter, iterate_frames, read_video_info
@@ -47,7 +46,7 @@ def draw_track(image: Image, item: OverlayItem, index: int, scale: float, colour
     K = scaled_camera(track.camera_matrix, scale)
     height, width = image.shape[:2]
     visible = bool(track.visible[index])
-    window = render_depth(item.mesh.vertices_m, item.mesh.faces, T, K)
+    window = item.mesh.drawn(T, K)
     if window is not None and visible:
         silhouette = window.mask_in_image(width, height).astype(np.uint8)
         contours, _ = cv2.findContours(silhouette, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_TC89_L1)

@@ -24,7 +24,6 @@ from scipy.spatial.transform import Rotation
 
 from .geometry import Array, Symmetry, invert_pose, make_pose, project, transform_points
 from .protocols import Image, Mask, PointTracker
-from .raster import render_depth
 from .region import TrackingMesh
 
 Translation = Literal["coarse", "pnp", "fused"]
@@ -120,7 +119,7 @@ def _followed(
 def lifted_points(seen: Seen, T: Array, mesh: TrackingMesh, camera_matrix: Array) -> tuple[Array, Array]:
     """Corners of the picture on the posed mesh: (P, 2) pixels, and (P, 3) where on the mesh they are, object frame."""
     height, width = seen.mask.shape
-    window = render_depth(mesh.vertices_m, mesh.faces, T, camera_matrix)
+    window = mesh.drawn(T, camera_matrix)
     nothing = np.zeros((0, 2)), np.zeros((0, 3))
     if window is None:
         return nothing

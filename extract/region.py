@@ -33,22 +33,32 @@ NO_EDGES = np.zeros((0, 0, 2), np.float32)
 
 @dataclass(frozen=True)
 class TrackingMesh:
-    """What the tracker needs of a mesh: vertices (V, 3) in m, faces (F, 3) int32, and spread-out surface centres."""
+    """What the tracker needs of a mesh: vertices (V, 3) in m, faces (F, 3) int32, and spread-out surface centres.
+
+    closed: see `render_depth`.
+    """
 
     vertices_m: Array
     faces: NDArray[np.int32]
     centres_m: Array
     tree: cKDTree = field(repr=False)
+    closed: bool = False
 
     @staticmethod
-    def build(vertices_m: Array, faces: NDArray[np.int32]) -> TrackingMesh:
+    def build(vertices_m: Array, faces: NDArray[np.int32], closed: bool = False) -> TrackingMesh:
         vertices = np.ascontiguousarray(vertices_m, float)
         centres = farthest_points(vertices, LOCAL_CENTRES)
-        return TrackingMesh(vertices, np.ascontiguousarray(faces, np.int32), centres, cKDTree(centres))
+        return TrackingMesh(vertices, np.ascontiguousarray(faces, np.int32), centres, cKDTree(centres), closed)
 
     @cached_property
     def radius_m(self) -> float:
         return float(np.linalg.norm(self.vertices_m, axis=1).max())
+
+    def drawn(self, T_camera_object: Array, camera_matrix: Array, margin_px: int = 2) -> DepthWindow | None:
+        """Its depth image at a pose, see `render_depth`."""
+        return render_depth(
+            self.vertices_m, self.faces, T_camera_object, camera_matrix, margin_px=margin_px, closed=self.closed
+        )
 
 
 @dataclass(frozen=True)
@@ -157,7 +167,7 @@ def draw_outline(
 
 def draw_window(mesh: TrackingMesh, T_camera_object: Array, camera_matrix: Array) -> DepthWindow | None:
     """The mesh drawn at a pose, with as much around it as `trace_outline` needs; None when it cannot be drawn."""
-    return render_depth(mesh.vertices_m, mesh.faces, T_camera_object, camera_matrix, margin_px=24)
+    return mesh.drawn(T_camera_object, camera_matrix, margin_px=24)
 
 
 def trace_outline(

@@ -59,7 +59,9 @@ def tracking_mesh(vessel: Vessel, faces: int = TRACKING_FACES) -> TrackingMesh:
     if len(mesh.faces) > faces:
         with THINNING:
             mesh = mesh.simplify_quadric_decimation(face_count=faces)
-    return TrackingMesh.build(np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int32))
+    # Made lighter still, thin walls pass through each other.
+    closed = faces >= TRACKING_FACES
+    return TrackingMesh.build(np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int32), closed)
 
 
 def fit_shape(
@@ -81,7 +83,7 @@ def fit_shape(
     values, poses = start.copy(), [view.T_camera_object for view in views]
     for step_px in steps_px:
         surface = _surface(vessel.category, {**vessel.params})
-        mesh = TrackingMesh.build(surface.vertices_m, surface.faces)
+        mesh = TrackingMesh.build(surface.vertices_m, surface.faces, closed=True)
         measured = [
             measure(mesh, T, camera_matrix, view.bins, view.colours, step_px, view.edges)
             for T, view in zip(poses, views, strict=True)

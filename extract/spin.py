@@ -19,7 +19,6 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from .colours import ColourModel
 from .geometry import Array
-from .raster import render_depth
 from .region import TrackingMesh
 from .region_kernels import look_up
 
@@ -70,7 +69,7 @@ def turn_scores(
     for m, pose in enumerate((T, mirrored(T))):
         for k in np.flatnonzero(asked[m]):
             at = spun(pose, 2 * np.pi * k / SPINS, axis_xy_m)
-            window = render_depth(mesh.vertices_m, mesh.faces, at, camera_matrix)
+            window = mesh.drawn(at, camera_matrix)
             if window is not None:
                 jump_m = JUMP * mesh.radius_m
                 _sum_up(window.depth_m, window.x0_px, window.y0_px, evidence, strength, jump_m, sums[m, k])

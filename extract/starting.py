@@ -22,7 +22,6 @@ from .crew import side_by_side
 from .errors import UserError
 from .first_pose import PoseCandidate, distinct, find_first_pose, judge
 from .geometry import Array, scaled_camera
-from .raster import render_depth
 from .region import TrackingMesh, edge_strength
 from .segment import Box, Mask, mask_box, mask_from_box, mask_from_silhouette
 from .shape_fit import View, coloured, fit_shape
@@ -285,7 +284,7 @@ def resized(mask: Mask, like: Image) -> Mask:
 
 
 def _silhouette(mesh: TrackingMesh, T: Array, camera_matrix: Array, shape: tuple[int, ...]) -> Mask:
-    window = render_depth(mesh.vertices_m, mesh.faces, T, camera_matrix)
+    window = mesh.drawn(T, camera_matrix)
     if window is None:
         return np.zeros((shape[0], shape[1]), bool)
     return window.mask_in_image(shape[1], shape[0])

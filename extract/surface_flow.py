@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from .geometry import Array, unproject
 from .point_tracks import moved_points
-from .raster import DepthWindow, render_depth
+from .raster import DepthWindow
 from .region import TrackingMesh
 
 CORNERS, APART_PX, PATCH_PX = 80, 5, 5
@@ -105,7 +105,7 @@ def spin_by_flow(
 
 def _lifted(mesh: TrackingMesh, T: Array, camera_matrix: Array, pixels: Array) -> tuple[Array, NDArray[np.bool_]]:
     """Points (M, 3) of the mesh, in its own frame, that pixels (N, 2) show, and (N,) which of them show any."""
-    window: DepthWindow | None = render_depth(mesh.vertices_m, mesh.faces, T, camera_matrix)
+    window: DepthWindow | None = mesh.drawn(T, camera_matrix)
     if window is None:
         return np.zeros((0, 3)), np.zeros(len(pixels), bool)
     height, width = window.depth_m.shape

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .geometry import Array, angle_between_rad, invert_pose, make_pose, unproject
-from .raster import DepthWindow, render_depth
+from .raster import DepthWindow
 from .region import Points, TrackingMesh
 from .region_kernels import draw_view, solve_pose
 from .segment import Mask
@@ -97,7 +97,7 @@ class Texture:
         views = self._views_for(T_predicted)
         if self._before is not None:
             views.append(self._before)
-        depth = render_depth(self.mesh.vertices_m, self.mesh.faces, T_predicted, camera_matrix) if views else None
+        depth = self.mesh.drawn(T_predicted, camera_matrix) if views else None
         if depth is None:
             return NO_MATCHES
         found = [_matched(view, picture, camera_matrix, T_predicted, depth) for view in views]
@@ -148,7 +148,7 @@ class Texture:
         key = key and len(self.views) < MOST_VIEWS and bool((apart >= VIEWS_APART_RAD).all())
         if not (key or self._off_m > 0.0):
             return
-        depth = render_depth(self.mesh.vertices_m, self.mesh.faces, T_camera_object, camera_matrix)
+        depth = self.mesh.drawn(T_camera_object, camera_matrix)
         if depth is None:
             return
         depth = depth if ours is None else depth.only(ours)

@@ -21,7 +21,6 @@ from .depth_term import LIKENESS, Surface, draw_surface, settle, share_on_surfac
 from .depth_video import DepthView
 from .first_pose import share_on_edges
 from .geometry import Array, Symmetry, make_pose, pose_change, project, scaled_camera, transform_points
-from .raster import render_depth
 from .region import Outline, TrackingMesh, draw_outline, edge_strength, measure, refine
 from .segment import Mask
 from .spin import mirrored, object_evidence
@@ -342,7 +341,7 @@ class ObjectTracker:
         for place in places:
             for R in turns:
                 T = make_pose(R, place)
-                window = render_depth(self.mesh.vertices_m, self.mesh.faces, T, camera)
+                window = self.mesh.drawn(T, camera)
                 if window is not None:
                     silhouette = window.mask_in_image(small.shape[1], small.shape[0])
                     scored.append((float(small[silhouette].sum()), len(scored), T))
