@@ -201,7 +201,7 @@ class Followed:
         shares = []
         for glimpse in self.glimpses:
             now = self.estimates[glimpse.index]
-            window = render_depth(self.mesh.vertices_m, self.mesh.faces, now.T_camera_object, half)
+            window = self.mesh.drawn(now.T_camera_object, half)
             if now.visible and window is not None:
                 silhouette = window.mask_in_image(glimpse.evidence.shape[1], glimpse.evidence.shape[0])
                 shares.append(spilled_share(silhouette, glimpse.evidence, glimpse.near_edge < 0))
