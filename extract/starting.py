@@ -32,6 +32,7 @@ STARTING_SIDE_PX = 1280  # the first frame, where thin parts such as spouts must
 FOUND_IOU = 0.45  # below this no pose of the mesh explains what was cut out of the first frame
 HYPOTHESES = 3  # first poses, far from each other, that a shape is fitted to
 HYPOTHESES_WITHIN = 0.5  # of the best one's merit
+KINDS = 4  # of pose, where it need not stand: either end up, leaning toward the camera or away
 APART_DEG = 40.0
 RIVAL_WITHIN = 0.2  # of the best one's merit: nearly as good
 FLAT_GREY_LEVELS = 2.0  # standard deviation in the box, below which there is nothing to see
@@ -142,7 +143,8 @@ def start_object(
         raise refusal
     found.sort(key=lambda entry: entry[1][0].pose.merit, reverse=True)
     box, fits = found[0]
-    kept = distinct([fit.pose for fit in fits], APART_DEG, HYPOTHESES, RIVAL_WITHIN, fits[0].model.symmetry)
+    within = RIVAL_WITHIN if standing else HYPOTHESES_WITHIN
+    kept = distinct([fit.pose for fit in fits], APART_DEG, len(fits), within, fits[0].model.symmetry)
     explained = [
         _hypothesis(fit, resized(fit.evidence(small, camera), rgb) if mask is None else mask, rgb, camera_matrix)
         for fit in fits
@@ -185,9 +187,11 @@ def _fits_in(
     cut = mask_from_box(rgb, box) if mask is None else mask
     trust = _trust(cut, labels)
 
+    count = HYPOTHESES if standing else KINDS
+
     def first_poses(model: Model) -> list[tuple[PoseCandidate, Model]]:
         poses = find_first_pose(model, rgb, cut, camera_matrix, box_xywh_px=box, trust=trust, standing=standing)
-        return [(pose, model) for pose in distinct(poses, APART_DEG, HYPOTHESES, HYPOTHESES_WITHIN, model.symmetry)]
+        return [(pose, model) for pose in distinct(poses, APART_DEG, count, HYPOTHESES_WITHIN, model.symmetry)]
 
     ranked = list(chain.from_iterable(side_by_side(first_poses, candidates)))
     ranked.sort(key=lambda entry: entry[0].merit, reverse=True)
@@ -198,14 +202,14 @@ def _fits_in(
         )
     if not standing:
         # Other kinds of pose are asked for then, not the same of several models.
-        kinds = distinct([pose for pose, _ in ranked], APART_DEG, HYPOTHESES, HYPOTHESES_WITHIN, ranked[0][1].symmetry)
+        kinds = distinct([pose for pose, _ in ranked], APART_DEG, count, HYPOTHESES_WITHIN, ranked[0][1].symmetry)
         ranked = [entry for entry in ranked if any(entry[0] is kind for kind in kinds)]
 
     def fitted(entry: tuple[PoseCandidate, Model]) -> _Fit:
         pose, model = entry
         return _fitted(model, pose, rgb, cut, box, source, camera_matrix, labels, 1, COARSE_STEPS_PX)
 
-    fits = side_by_side(fitted, ranked[:HYPOTHESES])
+    fits = side_by_side(fitted, ranked[:count])
     return sorted(fits, key=lambda fit: fit.pose.merit, reverse=True)
 
 
