@@ -16,7 +16,7 @@ import numpy as np
 
 from .background import COVERED, Background
 from .both_ways import Clip, Watched, follow_both_ways, look_again, settle_rivals
-from .candidates import Model, ObjectRequest
+from .candidates import Model, ObjectRequest, with_stoutest
 from .depth_size import sized
 from .depth_video import DepthVideo
 from .detect import find_places, motion_since
@@ -92,9 +92,15 @@ class Attempt:
         """How much of the handled object's colours goes on beyond its silhouette, as a share of that."""
         return self.followed[0].spilled
 
-    @cached_property
+    @property
     def in_part(self) -> bool:
-        """Whether only part of the object seems to be explained, and nothing printed on it says that it is right."""
+        """Whether only part of a body of revolution seems to be explained, and nothing printed on it says otherwise.
+
+        What has a handle or a spout shows which way up it is.
+        """
+        vessel = self.followed[0].vessel
+        if vessel is None or vessel.symmetry.order != 0:
+            return False
         return self.spilled > SPILLED and self.followed[0].flow_share < TOLD_BY_PRINT
 
     @cached_property
@@ -330,8 +336,9 @@ def _turned_otherwise(
     camera = scene.camera(scene.start_scale)
     try:
         start = start_object(
-            request, candidates, first.sharp, [known.box], known.box_source, camera, None, known.labels, standing=False
-        )
+            request, with_stoutest(candidates), first.sharp, [known.box], known.box_source, camera, None, known.labels,
+            standing=False,
+        )  # fmt: skip
     except NotFoundError:
         return None
     R, symmetry = known.best.pose.T_camera_object[:3, :3], known.best.model.symmetry

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -85,21 +85,27 @@ def candidate_models(request: ObjectRequest) -> list[Model]:
     return [Model(tracked, estimate_symmetry(mesh), header)]
 
 
-def _statures(category: str) -> list[Model]:
-    """The nominal vessel of a category, a low and a tall one: one that leans looks like another that does not.
+def with_stoutest(models: Sequence[Model]) -> list[Model]:
+    """The same, and of bodies of revolution the stoutest: nothing but its proportions tells how far one leans."""
+    round_ones = {m.vessel.category for m in models if m.vessel is not None and m.symmetry.order == 0}
+    stoutest = []
+    for category in sorted(round_ones):
+        space = parameter_space(category)
+        if "height_m" in space and "radius_m" in space:
+            size = {"height_m": space["height_m"].low, "radius_m": space["radius_m"].high}
+            stoutest.append(vessel_model(make_vessel(category, None, **{**make_vessel(category).params, **size})))
+    return [*models, *stoutest]
 
-    Of a body of revolution the stoutest as well: nothing but its proportions tells how far it leans.
-    """
-    nominal, space = make_vessel(category), parameter_space(category)
-    height, radius = space.get("height_m"), space.get("radius_m")
+
+def _statures(category: str) -> list[Model]:
+    """The nominal vessel of a category, a low and a tall one: one that leans looks like another that does not."""
+    nominal = make_vessel(category)
+    height = parameter_space(category).get("height_m")
     if height is None:
         return [vessel_model(nominal)]
     usual = nominal.params["height_m"]
     heights = (usual, usual + STATURE * (height.low - usual), usual + STATURE * (height.high - usual))
-    sizes = [{"height_m": h} for h in heights]
-    if nominal.symmetry.order == 0 and radius is not None:
-        sizes.append({"height_m": height.low, "radius_m": radius.high})
-    return [vessel_model(make_vessel(category, None, **{**nominal.params, **size})) for size in sizes]
+    return [vessel_model(make_vessel(category, None, **{**nominal.params, "height_m": h})) for h in heights]
 
 
 def vessel_model(vessel: Vessel) -> Model:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from vid2demo.extract.candidates import ObjectRequest, candidate_models
+from vid2demo.extract.candidates import ObjectRequest, candidate_models, with_stoutest
 from vid2demo.extract.first_pose import PoseCandidate, distinct, is_upright, silhouette_ious, upright_rotation
 from vid2demo.extract.geometry import Symmetry, make_pose
 from vid2demo.extract.raster import render_depth
@@ -112,7 +112,8 @@ def test_what_need_not_stand_is_several_things_turned_otherwise() -> None:
     assert window is not None
     mask = window.mask_in_image(640, 480)
     rgb = np.where(mask[..., None], (200, 170, 30), (90, 90, 95)).astype(np.uint8)
-    start = start_object(request, models, rgb, [mask_box(mask)], "given", K, standing=False)
+    assert len(with_stoutest(models)) == len(models) + 1
+    start = start_object(request, with_stoutest(models), rgb, [mask_box(mask)], "given", K, standing=False)
     axes = np.array([h.pose.T_camera_object[:3, 2] for h in start.hypotheses])
     assert len(axes) > 1
     angles_deg = np.rad2deg(np.arccos(np.clip(axes @ axes.T, -1, 1)))[~np.eye(len(axes), dtype=bool)]
