@@ -200,12 +200,15 @@ def _matched(
         return np.zeros((0, 3)), np.zeros((0, 2))
     corners = found + np.array([x0, y0], np.float32)
     there, ok, unlike = _flow(drawn, picture, corners)
-    back, ok_back, _ = _flow(picture, drawn, there)
-    near = np.linalg.norm(back - corners, axis=2)[:, 0] < FORTH_AND_BACK_PX
     # Sensor noise has corners as well, and flow that stays where it is: only patches that look alike are matches.
     x, y = np.round(corners[:, 0]).astype(int).T
     contrast = cv2.blur(np.abs(drawn[around].astype(np.float32) - 128), (PATCH_PX, PATCH_PX))[y - y0, x - x0]
-    good = near & (ok[:, 0] > 0) & (ok_back[:, 0] > 0) & (unlike[:, 0] < ALIKE * contrast)
+    good = (ok[:, 0] > 0) & (unlike[:, 0] < ALIKE * contrast)
+    if not good.any():
+        return np.zeros((0, 3)), np.zeros((0, 2))
+    corners, there, x, y = corners[good], there[good], x[good], y[good]
+    back, ok, _ = _flow(picture, drawn, there)
+    good = (ok[:, 0] > 0) & (np.linalg.norm(back - corners, axis=2)[:, 0] < FORTH_AND_BACK_PX)
     corners, there, x, y = corners[good, 0].astype(float), there[good, 0].astype(float), x[good], y[good]
     z = depth.depth_m[y - depth.y0_px, x - depth.x0_px].astype(float)
     return (unproject(camera_matrix, corners, z) - T[:3, 3]) @ T[:3, :3], there
