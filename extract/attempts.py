@@ -1,7 +1,8 @@
 """Attempts at a clip: its objects found in one frame and followed from there; and others where that is not sure.
 
-What is found in one frame may be wrong, and only the whole clip tells: it is then followed less surely. So attempts are
-made from other frames and from other boxes, as far as they are needed, and the surest is kept.
+What is found in one frame may be wrong, and only the whole clip tells: it is then followed less surely, or covers only
+part of the object. So attempts are made from other frames, from other boxes and, of what has neither handle nor spout,
+turned otherwise, as far as they are needed, and the best is kept.
 """
 
 from __future__ import annotations
@@ -346,7 +347,10 @@ def _turned_otherwise(
     for turned in start.hypotheses:
         if np.rad2deg(symmetry.error_rad(R, turned.pose.T_camera_object[:3, :3])) > APART_DEG:
             only = replace(start, hypotheses=(turned,))
-            attempts.append(_attempt(scene, first.index, first.sharp, [only], report, False))
+            attempt = _attempt(scene, first.index, first.sharp, [only], report, False)
+            others = [other for other in start.hypotheses if other is not turned]  # for the track's header
+            only = replace(attempt.starts[0], hypotheses=(attempt.starts[0].best, *others))
+            attempts.append(replace(attempt, starts=[only]))
     attempts = [_beside(first, attempt) for attempt in attempts if _begins_as(attempt, attempt)]
     return max(attempts, key=lambda attempt: attempt.worth, default=None)
 
