@@ -343,16 +343,16 @@ def _turned_otherwise(
     except NotFoundError:
         return None
     R, symmetry = known.best.pose.T_camera_object[:3, :3], known.best.model.symmetry
-    attempts = []
+    best: Attempt | None = None
     for turned in start.hypotheses:
-        if np.rad2deg(symmetry.error_rad(R, turned.pose.T_camera_object[:3, :3])) > APART_DEG:
-            only = replace(start, hypotheses=(turned,))
-            attempt = _attempt(scene, first.index, first.sharp, [only], report, False)
+        if np.rad2deg(symmetry.error_rad(R, turned.pose.T_camera_object[:3, :3])) <= APART_DEG:
+            continue
+        attempt = _attempt(scene, first.index, first.sharp, [replace(start, hypotheses=(turned,))], report, False)
+        if _begins_as(attempt, attempt) and (best is None or attempt.worth > best.worth):
             others = [other for other in start.hypotheses if other is not turned]  # for the track's header
-            only = replace(attempt.starts[0], hypotheses=(attempt.starts[0].best, *others))
-            attempts.append(replace(attempt, starts=[only]))
-    attempts = [_beside(first, attempt) for attempt in attempts if _begins_as(attempt, attempt)]
-    return max(attempts, key=lambda attempt: attempt.worth, default=None)
+            told = replace(attempt.starts[0], hypotheses=(attempt.starts[0].best, *others))
+            best = _beside(first, replace(attempt, starts=[told]))
+    return best
 
 
 def _beside(first: Attempt, other: Attempt) -> Attempt:
