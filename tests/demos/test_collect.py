@@ -27,6 +27,7 @@ def contents(root: Path) -> dict[str, bytes]:
     return {str(p.relative_to(root)): p.read_bytes() for p in sorted(root.rglob("*")) if p.is_file()}
 
 
+@pytest.mark.slow
 def test_keeps_successes_only_and_counts_the_rest(stand_in: str, stand_in_reference: Path, tmp_path: Path) -> None:
     figures = run(stand_in_reference, tmp_path / "dataset", stand_in)
     assert figures["episodes"] == 3

@@ -50,6 +50,7 @@ def test_a_receptacle_that_is_missed_is_moved_under_the_jet(faithful: Reference)
     np.testing.assert_array_equal(found.T_world_object, faithful.T_world_object)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("less_deg", [25.0, 40.0])  # so little that tipping it somewhat does not help yet
 def test_what_is_tipped_too_little_is_tipped_further(faithful: Reference, less_deg: float) -> None:
     little = tipped_further(faithful, -less_deg)
@@ -61,6 +62,7 @@ def test_what_is_tipped_too_little_is_tipped_further(faithful: Reference, less_d
     assert np.rad2deg(found.tilt_rad.max() - little.tilt_rad.max()) == pytest.approx(chosen["tip_deg"], abs=1e-6)
 
 
+@pytest.mark.slow
 def test_the_choice_does_not_depend_on_the_number_of_threads(faithful: Reference) -> None:
     aside = with_receptacle_moved(faithful, 0.09, 0.0)
     first, second = (search_scale(aside, no_other, num_threads=threads) for threads in (1, 3))
@@ -82,6 +84,7 @@ def test_pours_side_by_side_come_out_as_each_alone(faithful: Reference) -> None:
     assert len({fractions for fractions in together if fractions is not None}) >= 3
 
 
+@pytest.mark.slow
 def test_a_smaller_path_is_tried_where_no_place_catches_all(faithful: Reference) -> None:
     missed = with_receptacle_moved(faithful, 0.25, 0.0)
     asked = []

@@ -59,6 +59,7 @@ def test_the_built_in_pour_is_within_reach_and_touches_nothing(category: str) ->
     check_motion(builtin_reference(vessel=make_vessel(category)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("category", ["bowl", "saucepan", "pitcher"])
 def test_what_is_awkward_to_hold_or_aim_pours_too(category: str) -> None:
     reference = builtin_reference(vessel=make_vessel(category))

@@ -228,6 +228,7 @@ def test_too_long_a_path_is_scaled_about_the_pour_and_rotations_are_not() -> Non
     assert np.rad2deg(reference.tilt_rad.max()) == pytest.approx(60.0, abs=0.1)
 
 
+@pytest.mark.slow
 def test_a_scale_that_does_not_fit_says_which_part_by_how_much_and_what_would() -> None:
     track = pour_track(lift_m=0.8, side_m=1.2)
     with pytest.raises(

@@ -349,6 +349,7 @@ def test_rendering_arguments_are_checked(arguments: dict[str, Any], said: str, m
         PandaPourEnv(mug_pour, num_particles=0, **arguments)
 
 
+@pytest.mark.slow
 def test_forked_process_draws_what_its_parent_drew() -> None:
     code = """
 import multiprocessing

@@ -277,6 +277,7 @@ def test_a_missing_picture_is_told_before_the_library_is_made(
     assert not (tmp_path / "library").exists()
 
 
+@pytest.mark.slow
 def test_without_a_database_the_vessels_that_ship_are_one(
     scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:  # type: ignore[no-untyped-def]

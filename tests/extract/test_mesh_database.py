@@ -124,6 +124,7 @@ def test_killed_between_views_and_their_note_a_mesh_was_there_before(tmp_path: P
     assert (result.stored, result.same, result.before) == ([], [], ["box_0", "box_1"])
 
 
+@pytest.mark.slow
 def test_killed_half_way_nothing_is_lost_or_done_twice(tmp_path: Path) -> None:
     database = tmp_path / "db"
     code = (

@@ -43,6 +43,7 @@ def test_one_worker_needs_no_process_and_keeps_the_order(fragile: Any) -> None:
     assert list(in_processes(fragile, [3, 1, 2], 1)) == [(3, 9), (1, 1), (2, 4)]
 
 
+@pytest.mark.slow
 def test_a_worker_that_dies_costs_one_job_and_no_other(fragile: Any) -> None:
     found = dict(in_processes(fragile, list(range(12)), 2))
     assert found == {job: None if job == 7 else job * job for job in range(12)}

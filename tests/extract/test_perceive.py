@@ -107,6 +107,7 @@ def test_a_clip_is_followed_both_ways_from_any_frame(clip: Path, mesh_file: Path
         assert both > 0.9
 
 
+@pytest.mark.slow
 def test_what_was_followed_unsurely_is_looked_for_in_a_wider_box_as_well(
     clip: Path, mesh_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -267,6 +268,7 @@ def test_a_mesh_of_a_million_faces_is_decimated_and_said_to_be(tmp_path: Path) -
     assert model.symmetry.order == 0
 
 
+@pytest.mark.slow
 def test_a_recording_for_the_viewer_is_written(clip: Path, mesh_file: Path, tmp_path: Path) -> None:
     pytest.importorskip("rerun", reason="needs rerun-sdk")
     follow(clip, mesh_file, tmp_path, rerun=True)
