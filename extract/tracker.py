@@ -77,9 +77,9 @@ class Signs:
 
         A logistic regression over 525 refinements of poses wrong by up to 15 degrees and 12 % of the distance, in
         synthetic pours of a kettle, a mug and a bottle half hidden by its hand. In 40 whole clips of 8 categories,
-        where the mesh is only about that of the object (bench/tracking.py), of frames said to be right with 64, 75,
-        86, 93 and 98 % the upright axis was within 12 degrees in 80, 91, 86, 98 and 99 %, the spin about it as well in
-        38, 73, 70, 83 and 92 %. What is said with less than 50 % was right mostly: 88 of 6000 frames.
+        where the mesh is only about that of the object (bench/tracking.py), of frames said to be right with 64, 76,
+        86, 93 and 98 % the upright axis was within 12 degrees in 77, 91, 87, 98 and 99 %, the spin about it as well in
+        42, 78, 74, 87 and 93 %. What is said with less than 50 % was right mostly: 88 of 6000 frames.
         """
         a, b, c, d = LOGISTIC
         return float(1 / (1 + np.exp(-(a * self.agree + b * self.on_edges + c * self.rigid + d))))
