@@ -7,18 +7,17 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 
+MOST_THREADS = 4  # that do jobs side by side: every one of them waits for Python's lock now and then
+
 
 def usable_cpus() -> int:
     """How many processors this process may run on."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-MOST = 4  # threads that do jobs side by side: every one of them waits for Python's lock now and then
-
-
 def side_by_side[Job, Found](work: Callable[[Job], Found], jobs: Sequence[Job]) -> list[Found]:
-    """work(job) of every job, in their order, on as many threads as there are processors, MOST at most."""
-    crew = Crew(max(1, min(usable_cpus(), MOST, len(jobs))))
+    """work(job) of every job, in their order, on as many threads as there are processors, MOST_THREADS at most."""
+    crew = Crew(max(1, min(usable_cpus(), MOST_THREADS, len(jobs))))
     try:
         return crew.run(lambda k: work(jobs[k]), range(len(jobs)))
     finally:

@@ -102,21 +102,39 @@ def test_silhouettes_are_compared_with_masks_in_the_image_and_as_far_as_these_ar
         assert found[1] == pytest.approx(1.0)
 
 
-def test_what_need_not_stand_is_several_things_turned_otherwise() -> None:
-    """A bottle that hangs with its neck down and toward the camera, painted in one colour."""
-    request = ObjectRequest("bottle")
-    models = candidate_models(request)
+def hanging_bottle() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """A picture of a bottle with its neck down and toward the camera, in one colour; its mask, pose and camera."""
+    bottle = candidate_models(ObjectRequest("bottle"))[0].mesh
     K = np.array([[600.0, 0.0, 320.0], [0.0, 600.0, 240.0], [0.0, 0.0, 1.0]])
     T = make_pose(upright_rotation(35, 0, 160), (0.0, 0.0, 0.9))
-    window = render_depth(models[0].mesh.vertices_m, models[0].mesh.faces, T, K)
+    window = render_depth(bottle.vertices_m, bottle.faces, T, K)
     assert window is not None
     mask = window.mask_in_image(640, 480)
-    rgb = np.where(mask[..., None], (200, 170, 30), (90, 90, 95)).astype(np.uint8)
-    assert len(with_stoutest(models)) == len(models) + 1
-    start = start_object(request, with_stoutest(models), rgb, [mask_box(mask)], "given", K, standing=False)
+    return np.where(mask[..., None], (200, 170, 30), (90, 90, 95)).astype(np.uint8), mask, T, K
+
+
+def test_what_need_not_stand_is_several_things_turned_otherwise() -> None:
+    request = ObjectRequest("bottle")
+    models = with_stoutest(candidate_models(request))
+    assert len(models) == len(candidate_models(request)) + 1
+    rgb, mask, T, K = hanging_bottle()
+    start = start_object(request, models, rgb, [mask_box(mask)], "given", K, standing=False)
     axes = np.array([h.pose.T_camera_object[:3, 2] for h in start.hypotheses])
     assert len(axes) > 1
     angles_deg = np.rad2deg(np.arccos(np.clip(axes @ axes.T, -1, 1)))[~np.eye(len(axes), dtype=bool)]
     assert angles_deg.min() > APART_DEG - 5  # the fit that follows moves them a little
     assert np.rad2deg(np.arccos(axes @ T[:3, 2])).min() < 15  # what it is, is among them
     assert not any(h.pose.stands for h in start.hypotheses)
+
+
+def test_the_start_does_not_depend_on_the_number_of_processors(monkeypatch: pytest.MonkeyPatch) -> None:
+    request = ObjectRequest("bottle")
+    rgb, mask, _, K = hanging_bottle()
+    starts = []
+    for count in (1, 3):
+        monkeypatch.setattr("vid2demo.extract.crew.usable_cpus", lambda count=count: count)
+        starts.append(start_object(request, candidate_models(request), rgb, [mask_box(mask)], "given", K))
+    one, other = (start.best for start in starts)
+    assert np.array_equal(one.pose.T_camera_object, other.pose.T_camera_object)
+    assert np.array_equal(one.evidence, other.evidence)
+    assert one.model.header == other.model.header
